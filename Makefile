@@ -47,6 +47,7 @@ test-all: $(test_stamp)
 	$(pytest) -m 'long or not long' $(PYTEST_ARGS)
 
 lint: $(test_stamp)
+	$(bin)/ruff format --check --quiet . || { echo 'layout: run $(bin)/ruff format .' >&2; exit 1; }
 	$(bin)/ruff check .
 	$(bin)/mypy
 

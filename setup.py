@@ -38,20 +38,30 @@ def compile_kernels(folder: str) -> None:
     In a process of its own that sees what the installed package will see: build environments (pip
     without its option --no-build-isolation, colcon) put a sitecustomize.py in front.
     """
-    paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
-             if path and not (Path(path) / 'sitecustomize.py').exists()]
+    paths = [
+        path
+        for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
+        if path and not (Path(path) / 'sitecustomize.py').exists()
+    ]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    commands = [[sys.executable, '-c', f'import {NAME}.{module} as module; module.{call}']
-                for module, call in WARM_UPS.items()]
+    commands = [
+        [sys.executable, '-c', f'import {NAME}.{module} as module; module.{call}']
+        for module, call in WARM_UPS.items()
+    ]
     # The first one uses two cores, and has most of what the others need.
     for group in (commands[:1], commands[1:]):
-        for process in [subprocess.Popen(command, cwd=folder, env=environment, text=True,
-                                         stderr=subprocess.PIPE) for command in group]:
+        for process in [
+            subprocess.Popen(
+                command, cwd=folder, env=environment, text=True, stderr=subprocess.PIPE
+            )
+            for command in group
+        ]:
             _, errors = process.communicate()
             if process.returncode:
                 reason = (errors.splitlines() or ['no reason given'])[-1]
                 logging.getLogger(NAME).warning(
-                    'kernels will be compiled by the first start of the node: %s', reason)
+                    'kernels will be compiled by the first start of the node: %s', reason
+                )
 
 
 class BuildWithKernels(build_py):

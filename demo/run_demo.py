@@ -49,8 +49,10 @@ STARTED = time.monotonic()
 
 def compare(table: Path, stamps: Path) -> list[str]:
     """Replay the bag with all methods in parallel; the lines to print."""
-    log("replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
-        'metric path ...')
+    log(
+        "replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
+        'metric path ...'
+    )
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
         derotated = pool.submit(five_point_when_derotated, BAG, read_parameters(PARAMETERS), OUT)
@@ -58,8 +60,13 @@ def compare(table: Path, stamps: Path) -> list[str]:
         replayed = compare_live(table, stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
         shift = draw_before_and_after()
-        scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
-                  *(future.result() for future in paper), *opencv, derotated.result()]
+        scores = [
+            replayed.node,
+            score_of_records('the same, replayed', replayed.records),
+            *(future.result() for future in paper),
+            *opencv,
+            derotated.result(),
+        ]
         draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
         largest = f'images derotated to their middle row: pixels move by up to {shift:.1f} px'
         return [*score_table(scores), '', *remarks(replayed, opencv), largest, path.result()]
@@ -76,23 +83,31 @@ def draw_before_and_after() -> float:
     loop = unrolling_loop(parameters, offline=True)
     with open_bag(BAG) as bag:
         messages = sensor_messages(bag, bag.find_topics())
-        frame = max((outcome.result for outcome in
-                     outcomes(loop, Intake(loop.sequencer, parameters), messages)
-                     if isinstance(outcome, Frame) and outcome.result is not None),
-                    key=lambda found: found.map.shift)
-    cv2.imwrite(str(OUT / BEFORE_AND_AFTER),
-                np.hstack([frame.original.values, frame.image().values]))
+        frame = max(
+            (
+                outcome.result
+                for outcome in outcomes(loop, Intake(loop.sequencer, parameters), messages)
+                if isinstance(outcome, Frame) and outcome.result is not None
+            ),
+            key=lambda found: found.map.shift,
+        )
+    cv2.imwrite(
+        str(OUT / BEFORE_AND_AFTER), np.hstack([frame.original.values, frame.image().values])
+    )
     return frame.map.shift
 
 
 def metric_path() -> str:
     """Odometry of the bag; the line to print."""
     from rs_relpose_ros.odometry.offline import odometry_into
+
     with open_bag(BAG) as bag:
         found = odometry_into(OUT, bag, bag.find_topics(), read_parameters(PARAMETERS))
     errors = found.metrics['live']
-    return (f'metric path from pairs and IMU: {100.0 * errors["ate_m"]:.1f} cm off (rms) over '
-            f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
+    return (
+        f'metric path from pairs and IMU: {100.0 * errors["ate_m"]:.1f} cm off (rms) over '
+        f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %'
+    )
 
 
 def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
@@ -100,14 +115,22 @@ def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
     without = [record for record in replayed.records if record.pose.status is not Status.OK]
     statuses = ', '.join(sorted({record.pose.status.value for record in without}))
     equal = f'{replayed.unequal} of them not equal' if replayed.unequal else 'bit-equal'
-    lines = [(f'no pose: {len(without)} pairs ({statuses}); in {sum(map(is_still, without))} the '
-              'camera hardly moves'),
-             (f'live: {replayed.processed} of {replayed.frames} frames processed; '
-              f'{replayed.poses} poses, {equal} to the replay of the same frames')]
+    lines = [
+        (
+            f'no pose: {len(without)} pairs ({statuses}); in {sum(map(is_still, without))} the '
+            'camera hardly moves'
+        ),
+        (
+            f'live: {replayed.processed} of {replayed.frames} frames processed; '
+            f'{replayed.poses} poses, {equal} to the replay of the same frames'
+        ),
+    ]
     best = min(opencv, key=lambda s: s.rotation[0])
     if replayed.node.rotation[0] > 0.0 and best.answered:
-        lines.append(f'rotation: {best.rotation[0] / replayed.node.rotation[0]:.0f} times better '
-                     'than the better OpenCV row, which ignores the rolling shutter and the IMU')
+        lines.append(
+            f'rotation: {best.rotation[0] / replayed.node.rotation[0]:.0f} times better '
+            'than the better OpenCV row, which ignores the rolling shutter and the IMU'
+        )
     return lines
 
 
@@ -130,8 +153,17 @@ def main() -> int:
     print('\n'.join(lines))
     print()
     print('pictures and tables:')
-    for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png',
-                 BEFORE_AND_AFTER, PATH, 'trajectory.tum', POSES.file, 'live.csv'):
+    for name in (
+        'matches.png',
+        'errors.png',
+        'residuals.png',
+        'rotation.png',
+        BEFORE_AND_AFTER,
+        PATH,
+        'trajectory.tum',
+        POSES.file,
+        'live.csv',
+    ):
         print(f'  {(OUT / name).relative_to(ROOT)}')
     return 0
 

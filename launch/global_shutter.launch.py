@@ -16,6 +16,13 @@ from launch_ros.substitutions import FindPackageShare
 
 def generate_launch_description() -> LaunchDescription:
     """The launch file of relpose_node, with the other node."""
-    return LaunchDescription([IncludeLaunchDescription(
-        PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py']),
-        launch_arguments={'executable': 'global_shutter_node'}.items())])
+    return LaunchDescription(
+        [
+            IncludeLaunchDescription(
+                PathJoinSubstitution(
+                    [FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py']
+                ),
+                launch_arguments={'executable': 'global_shutter_node'}.items(),
+            )
+        ]
+    )

@@ -18,10 +18,12 @@ def packaged(name: str) -> tuple[str, tuple[SourcedValue, ...]]:
     text = (Path(__file__).parent / 'recordings' / f'{name}.yaml').read_text(encoding='utf-8')
     head, body = text.split('/**:\n  ros__parameters:\n')
     return _prose(head), tuple(
-        SourcedValue(parameter, tuple(value) if isinstance(value, list) else value,
-                     _prose(comment))
+        SourcedValue(
+            parameter, tuple(value) if isinstance(value, list) else value, _prose(comment)
+        )
         for comment, parameter, word in re.findall(r'((?: +#.*\n)+) +(\w+): (.*)\n', body)
-        for value in [yaml.safe_load(word)])
+        for value in [yaml.safe_load(word)]
+    )
 
 
 def _prose(comment: str) -> str:
@@ -58,13 +60,20 @@ def read_realsense(folder: Path) -> convert.Recording:
     title, parameters = packaged('realsense_rgb_rs')
     return convert.Recording(
         _realsense_camera(folder / 'camera.txt', _readout_time(parameters)),
-        tuple(convert.image_file(row.nanoseconds('stamp_ns'),
-                                 convert.file_inside(folder, row, 'file'))
-              for row in convert.read_table(folder / 'frames.csv')),
+        tuple(
+            convert.image_file(
+                row.nanoseconds('stamp_ns'), convert.file_inside(folder, row, 'file')
+            )
+            for row in convert.read_table(folder / 'frames.csv')
+        ),
         ordered_samples(
             ImuSample(row.nanoseconds(0), row.vector(1, 2, 3), row.vector(4, 5, 6))
-            for row in convert.read_rows(folder / 'imu.txt', range(7), separator=None)),
-        title, parameters, image_format='mono8; jpeg compressed mono8')
+            for row in convert.read_rows(folder / 'imu.txt', range(7), separator=None)
+        ),
+        title,
+        parameters,
+        image_format='mono8; jpeg compressed mono8',
+    )
 
 
 def _realsense_camera(path: Path, readout_time: float) -> RollingShutterCamera:
@@ -72,19 +81,23 @@ def _realsense_camera(path: Path, readout_time: float) -> RollingShutterCamera:
         raise MissingInputError(f'{path.name} is missing: there is no file {path}')
     # Only the first two lines are calibration: then DM-VIO's own crop follows.
     lines = path.read_text(encoding='utf-8', errors='replace').splitlines()[:2]
-    rows = [convert.Row(path, number, dict(enumerate(line.split())))
-            for number, line in enumerate(lines, start=1)]
+    rows = [
+        convert.Row(path, number, dict(enumerate(line.split())))
+        for number, line in enumerate(lines, start=1)
+    ]
     if [len(row.words) for row in rows] != [5, 2]:
         raise InputError(f'{path} must begin with "fx fy cx cy distortion" and "width height"')
     fx, fy, cx, cy, distortion = map(rows[0].real, range(5))
     if distortion != 0.0:
-        raise rows[0].error(f'the FOV distortion {distortion:g} of this format is not supported: '
-                            'it must be 0')
+        raise rows[0].error(
+            f'the FOV distortion {distortion:g} of this format is not supported: it must be 0'
+        )
     width, height = map(rows[1].integer, range(2))
     if not (0 < width < 100_000 and 0 < height < 100_000):
         raise rows[1].error(f'there must be a number of pixels, got {width}x{height}')
-    return RollingShutterCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy,
-                                readout_time=readout_time)
+    return RollingShutterCamera(
+        width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, readout_time=readout_time
+    )
 
 
 def read_xiaomi(folder: Path) -> convert.Recording:
@@ -99,12 +112,17 @@ def read_xiaomi(folder: Path) -> convert.Recording:
 
     There is no accelerometer.
     """
-    stamps = [row.seconds_as_nanoseconds(0)
-              for row in convert.read_rows(folder / 'framestamp.txt', range(1))]
+    stamps = [
+        row.seconds_as_nanoseconds(0)
+        for row in convert.read_rows(folder / 'framestamp.txt', range(1))
+    ]
     if not (folder / 'images').is_dir():
         raise MissingInputError(f'the folder of images is missing: there is no {folder}/images')
-    found = {int(match[1]): path for path in (folder / 'images').iterdir()
-             if (match := _XIAOMI_IMAGE.fullmatch(path.name))}
+    found = {
+        int(match[1]): path
+        for path in (folder / 'images').iterdir()
+        if (match := _XIAOMI_IMAGE.fullmatch(path.name))
+    }
     if not found:
         raise MissingInputError(f'{folder}/images has no images RE_frame-N.jpg')
     for number, path in found.items():
@@ -113,12 +131,22 @@ def read_xiaomi(folder: Path) -> convert.Recording:
     title, parameters = packaged('xiaomi_cc9_rs')
     # Calibrated by the repository, for its images of 800x600. Its skew of -0.7 px per unit of y/z
     # has no field in CameraInfo; without it, no point moves by more than 0.4 px.
-    camera = RollingShutterCamera(width=800, height=600, fx=573.8534, fy=575.0448, cx=406.0101,
-                                  cy=309.0112, readout_time=_readout_time(parameters))
+    camera = RollingShutterCamera(
+        width=800,
+        height=600,
+        fx=573.8534,
+        fy=575.0448,
+        cx=406.0101,
+        cy=309.0112,
+        readout_time=_readout_time(parameters),
+    )
     return convert.Recording(
         camera,
         tuple(convert.image_file(stamps[number - 1], found[number]) for number in sorted(found)),
         ordered_samples(
             ImuSample(row.seconds_as_nanoseconds(3), row.vector(0, 1, 2), None)
-            for row in convert.read_rows(folder / 'gyro.txt', range(4))),
-        title, parameters)
+            for row in convert.read_rows(folder / 'gyro.txt', range(4))
+        ),
+        title,
+        parameters,
+    )

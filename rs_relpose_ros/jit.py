@@ -37,7 +37,7 @@ def source_digest(module: str) -> str:
     source = Path(str(sys.modules[module].__file__)).read_bytes()
     digest = hashlib.sha256(source)
     for package, names in _IMPORT.findall(source.decode()):
-        for name in re.findall(r'\w+', names):   # of a function or of a module
+        for name in re.findall(r'\w+', names):  # of a function or of a module
             inner = f'{package}.{name}'
             digest.update(source_digest(inner if inner in sys.modules else package).encode())
     return digest.hexdigest()
@@ -47,10 +47,13 @@ def source_digest(module: str) -> str:
 def _folder() -> Path:
     """NUMBA_CACHE_DIR, the folder of the build or, if that is read-only, a user's links to it."""
     built, chosen = _PACKAGE / '__pycache__' / 'kernels', os.environ.get('NUMBA_CACHE_DIR')
-    users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache', _PACKAGE.name,
-                 hashlib.sha256(str(_PACKAGE).encode()).hexdigest()[:16])
+    users = Path(
+        os.environ.get('XDG_CACHE_HOME') or '~/.cache',
+        _PACKAGE.name,
+        hashlib.sha256(str(_PACKAGE).encode()).hexdigest()[:16],
+    )
     for place in (Path(chosen, _PACKAGE.name) if chosen else built, users):
-        with contextlib.suppress(OSError, RuntimeError):   # read-only, or the user has no home
+        with contextlib.suppress(OSError, RuntimeError):  # read-only, or the user has no home
             (folder := place.expanduser()).mkdir(parents=True, exist_ok=True)
             if os.access(folder, os.W_OK):
                 break
@@ -88,11 +91,15 @@ except AttributeError:
     _TEXT = b''.join(path.read_bytes() for path in sorted(_PACKAGE.rglob('*.py')))
     vars(numba.config)['CACHE_DIR'] = str(_folder() / hashlib.sha256(_TEXT).hexdigest())
 
-_OPTIONS: dict[str, Any] = {'cache': True, 'nogil': True, 'error_model': 'numpy',
-                            'no_cfunc_wrapper': True}   # it takes a tenth of the compilation
+_OPTIONS: dict[str, Any] = {
+    'cache': True,
+    'nogil': True,
+    'error_model': 'numpy',
+    'no_cfunc_wrapper': True,
+}  # it takes a tenth of the compilation
 kernel = numba.njit(**_OPTIONS)
-inlined_kernel = numba.njit(**_OPTIONS, forceinline=True)   # as machine code: innermost loops
-small_kernel = numba.njit(**_OPTIONS, inline='always')   # as statements: a few lines, one call
+inlined_kernel = numba.njit(**_OPTIONS, forceinline=True)  # as machine code: innermost loops
+small_kernel = numba.njit(**_OPTIONS, inline='always')  # as statements: a few lines, one call
 
 
 class KernelInterface:
@@ -112,7 +119,7 @@ class KernelInterface:
             return signature.return_type(address, *signature.args), generate
 
         names = [Parameter(f'a{k}', Parameter.POSITIONAL_ONLY) for k in range(2 + len(arguments))]
-        typed_call.__signature__ = Signature(names)   # type: ignore[attr-defined]
+        typed_call.__signature__ = Signature(names)  # type: ignore[attr-defined]
         self.call: Any = intrinsic(typed_call)
 
     def address(self, function: Any) -> int:

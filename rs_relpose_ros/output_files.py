@@ -19,6 +19,7 @@ def save_picture(picture: Figure, path: Path) -> None:
     """Write a plot as PNG on white; the same file for every backend, version and user."""
     import matplotlib as mpl  # takes a second, and a node draws nothing
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     with mpl.rc_context({'savefig.facecolor': 'white'}):
         FigureCanvasAgg(picture)
         with written(path, 'wb') as file:
@@ -40,8 +41,13 @@ def refuse_existing(*paths: Path) -> None:
 def refuse_unwritable(folder: Path) -> None:
     """Raise an InputError if a folder cannot be created or written; it is not created."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    problem = ('is a file' if not nearest.is_dir() else
-               '' if os.access(nearest, os.W_OK | os.X_OK) else 'cannot be written')
+    problem = (
+        'is a file'
+        if not nearest.is_dir()
+        else ''
+        if os.access(nearest, os.W_OK | os.X_OK)
+        else 'cannot be written'
+    )
     if problem:
         raise InputError(f'{nearest} {problem}: choose another directory for the results')
 
@@ -54,8 +60,12 @@ def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
     """
     part, text = path.with_name(f'{path.name}.part'), 'b' not in mode
     try:
-        with part.open(mode, encoding='utf-8' if text else None, newline='' if text else None,
-                       buffering=1 if text else -1) as file:
+        with part.open(
+            mode,
+            encoding='utf-8' if text else None,
+            newline='' if text else None,
+            buffering=1 if text else -1,
+        ) as file:
             yield file
         part.replace(path)
     except Exception as error:
@@ -86,14 +96,15 @@ def beside(out: Path) -> Iterator[Path]:
     """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = tempfile.TemporaryDirectory(prefix=f'.{out.name}.', suffix='.part',
-                                                dir=out.parent)
+        temporary = tempfile.TemporaryDirectory(
+            prefix=f'.{out.name}.', suffix='.part', dir=out.parent
+        )
     except OSError as error:
         raise InputError(f'{out} cannot be written: {error.strerror}') from error
     with temporary as folder:
         try:
             yield Path(folder) / out.name
         except OSError as error:
-            if folder in str(error.filename or folder):   # not of an input
+            if folder in str(error.filename or folder):  # not of an input
                 raise type(error)(error.errno, error.strerror, str(out)) from error
             raise

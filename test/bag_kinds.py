@@ -18,8 +18,11 @@ from rs_relpose_ros.messages import outgoing
 
 STAMP_NS = 1_700_000_000_123_456_789
 IMAGE, INFO, IMU, POSE = (
-    'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo', 'sensor_msgs/msg/Imu',
-    'geometry_msgs/msg/PoseStamped')
+    'sensor_msgs/msg/Image',
+    'sensor_msgs/msg/CameraInfo',
+    'sensor_msgs/msg/Imu',
+    'geometry_msgs/msg/PoseStamped',
+)
 CAMERA = RollingShutterCamera(width=8, height=6, fx=5.0, fy=5.5, cx=3.5, cy=2.5, readout_time=0.03)
 PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 JAZZY = build.TYPESTORE
@@ -28,12 +31,19 @@ NOETIC = get_typestore(Stores.ROS1_NOETIC)
 ROSBAG2_KINDS = {
     f'{name}{suffix}': (storage, mode)
     for name, storage in (('sqlite3', StoragePlugin.SQLITE3), ('mcap', StoragePlugin.MCAP))
-    for suffix, mode in (('', CompressionMode.NONE), ('_zstd_files', CompressionMode.FILE),
-                         ('_zstd_messages', CompressionMode.MESSAGE),
-                         ('_zstd_chunks', CompressionMode.STORAGE))
-    if not (name == 'sqlite3' and mode is CompressionMode.STORAGE)}
-ROS1_KINDS = {'ros1': None, 'ros1_lz4': Ros1Writer.CompressionFormat.LZ4,
-              'ros1_bz2': Ros1Writer.CompressionFormat.BZ2}
+    for suffix, mode in (
+        ('', CompressionMode.NONE),
+        ('_zstd_files', CompressionMode.FILE),
+        ('_zstd_messages', CompressionMode.MESSAGE),
+        ('_zstd_chunks', CompressionMode.STORAGE),
+    )
+    if not (name == 'sqlite3' and mode is CompressionMode.STORAGE)
+}
+ROS1_KINDS = {
+    'ros1': None,
+    'ros1_lz4': Ros1Writer.CompressionFormat.LZ4,
+    'ros1_bz2': Ros1Writer.CompressionFormat.BZ2,
+}
 KINDS = (*ROSBAG2_KINDS, *ROS1_KINDS)
 
 # Topic, type, message and time after STAMP_NS.
@@ -45,28 +55,51 @@ def imu(t: int, rate: tuple[float, float, float]) -> Entry:
 
 
 def image(t: int, pixels: np.ndarray) -> Entry:
-    return ('/camera/image_raw', IMAGE,
-            build.gray_image(build.rosbags_types, pixels, STAMP_NS + t), t)
+    return (
+        '/camera/image_raw',
+        IMAGE,
+        build.gray_image(build.rosbags_types, pixels, STAMP_NS + t),
+        t,
+    )
 
 
 def info(t: int, camera: RollingShutterCamera) -> Entry:
-    return ('/camera/camera_info', INFO, outgoing.camera_info_message(
-        STAMP_NS + t, 'camera', camera, None, build.rosbags_types), t)
+    return (
+        '/camera/camera_info',
+        INFO,
+        outgoing.camera_info_message(STAMP_NS + t, 'camera', camera, None, build.rosbags_types),
+        t,
+    )
 
 
 def pose(t: int, position: tuple[float, float, float]) -> Entry:
-    return ('/ground_truth/pose', POSE, outgoing.pose_stamped_message(
-        STAMP_NS + t, 'world', (0.0, 0.0, 0.0, 1.0), position, build.rosbags_types), t)
+    return (
+        '/ground_truth/pose',
+        POSE,
+        outgoing.pose_stamped_message(
+            STAMP_NS + t, 'world', (0.0, 0.0, 0.0, 1.0), position, build.rosbags_types
+        ),
+        t,
+    )
 
 
 def camera_messages() -> list[Entry]:
     """A short recording, not in the order of time."""
-    return [*(imu(t, (0.1 * t, 0.2, 0.3)) for t in (1, 3, 5, 7)),
-            image(4, PIXELS), info(2, CAMERA), pose(6, (1.0, 2.0, 3.0))]
+    return [
+        *(imu(t, (0.1 * t, 0.2, 0.3)) for t in (1, 3, 5, 7)),
+        image(4, PIXELS),
+        info(2, CAMERA),
+        pose(6, (1.0, 2.0, 3.0)),
+    ]
 
 
-def write_kind(kind: str, folder: Path, messages: list[Entry] | None = None,
-               serialize: Callable[..., bytes] = JAZZY.serialize_cdr, **offered: Any) -> Path:
+def write_kind(
+    kind: str,
+    folder: Path,
+    messages: list[Entry] | None = None,
+    serialize: Callable[..., bytes] = JAZZY.serialize_cdr,
+    **offered: Any,
+) -> Path:
     """A bag of one of `KINDS`, by default with `camera_messages`; `offered`: of its topics."""
     writer: Any
     if kind in ROS1_KINDS:
@@ -85,8 +118,9 @@ def write_kind(kind: str, folder: Path, messages: list[Entry] | None = None,
         connections: dict[str, Any] = {}
         for topic, msgtype, message, time in camera_messages() if messages is None else messages:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore,
-                                                           **offered)
+                connections[topic] = writer.add_connection(
+                    topic, msgtype, typestore=typestore, **offered
+                )
             writer.write(connections[topic], STAMP_NS + time, serialize(message, msgtype))
     return writer.path
 
@@ -104,8 +138,13 @@ def as_ros1(message: Any) -> Any:
     return NOETIC.types[message.__msgtype__](**values)
 
 
-def copied(source: Path, path: Path, change: Callable[[Any], bool | None] = lambda message: None,
-           seconds: float = math.inf, first: Sequence[tuple[str, Any]] = ()) -> Path:
+def copied(
+    source: Path,
+    path: Path,
+    change: Callable[[Any], bool | None] = lambda message: None,
+    seconds: float = math.inf,
+    first: Sequence[tuple[str, Any]] = (),
+) -> Path:
     """The first seconds of a bag, its messages changed in place; left out where that is true.
 
     `first`: topics and messages before them.
@@ -123,5 +162,8 @@ def copied(source: Path, path: Path, change: Callable[[Any], bool | None] = lamb
 
 def storage_file(bag: Path) -> Path:
     """The file with the messages."""
-    return bag if bag.is_file() else next(
-        file for file in sorted(bag.iterdir()) if file.name != 'metadata.yaml')
+    return (
+        bag
+        if bag.is_file()
+        else next(file for file in sorted(bag.iterdir()) if file.name != 'metadata.yaml')
+    )

@@ -19,8 +19,13 @@ PATIENCE = 60.0
 
 def send(node: Any, count: int) -> None:
     publisher = node.create_publisher(Image, TOPIC, qos_profile_sensor_data)
-    image = Image(width=WIDTH, height=HEIGHT, encoding='bgr8', step=3 * WIDTH,
-                  data=array('B', bytes(3 * WIDTH * HEIGHT)))
+    image = Image(
+        width=WIDTH,
+        height=HEIGHT,
+        encoding='bgr8',
+        step=3 * WIDTH,
+        data=array('B', bytes(3 * WIDTH * HEIGHT)),
+    )
     deadline = time.monotonic() + PATIENCE
     while not publisher.get_subscription_count() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -35,8 +40,9 @@ def send(node: Any, count: int) -> None:
 def receive(node: Any, count: int) -> None:
     received: list[bytes] = []
     # As they come from the wire: what Python makes of them is another matter.
-    node.create_subscription(Image, TOPIC, lambda raw: received.append(raw[4:8]),
-                             qos_profile_sensor_data, raw=True)
+    node.create_subscription(
+        Image, TOPIC, lambda raw: received.append(raw[4:8]), qos_profile_sensor_data, raw=True
+    )
     print('ready', flush=True)
     deadline = time.monotonic() + PATIENCE
     last = (count - 1).to_bytes(4, 'little')

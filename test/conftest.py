@@ -16,9 +16,13 @@ ROOT = Path(__file__).resolve().parent.parent
 BUNDLED_PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
 
 # The same examples in every run; the first one may compile kernels.
-settings.register_profile('repeatable', derandomize=True, deadline=None, database=None,
-                          suppress_health_check=[HealthCheck.too_slow,
-                                                 HealthCheck.data_too_large])
+settings.register_profile(
+    'repeatable',
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
 settings.load_profile('repeatable')
 
 
@@ -49,8 +53,11 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 
 # Modules with live tests.
-LIVE = {path.name for path in Path(__file__).parent.glob('test_*.py')
-        if 'pytest.mark.live' in path.read_text(encoding='utf-8')}
+LIVE = {
+    path.name
+    for path in Path(__file__).parent.glob('test_*.py')
+    if 'pytest.mark.live' in path.read_text(encoding='utf-8')
+}
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -86,7 +93,7 @@ def recordings_folder() -> Path:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if 'PYTEST_XDIST_WORKER' in os.environ and item.path.name not in LIVE:
-        os.nice(max(10 - os.nice(0), 0))   # live tests first
+        os.nice(max(10 - os.nice(0), 0))  # live tests first
     if item.get_closest_marker('recordings'):
         recordings_folder()
 
@@ -105,9 +112,19 @@ def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Cal
     def bag(name: str, source: str = '') -> Path:
         path = folder / name
         if not path.exists():
-            assert command_line.main(['convert', source or name.removesuffix('_b'),
-                                      str(recordings / name), str(path)]) == 0
+            assert (
+                command_line.main(
+                    [
+                        'convert',
+                        source or name.removesuffix('_b'),
+                        str(recordings / name),
+                        str(path),
+                    ]
+                )
+                == 0
+            )
         return path
+
     return bag
 
 
@@ -122,11 +139,13 @@ def bundled_bag() -> Path:
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
     """Runs a command line that is refused: exit code 2, and one line with these words."""
+
     def run(words: str, *arguments: object) -> None:
         assert command_line.main([str(argument) for argument in arguments]) == 2
         error = capsys.readouterr().err
         assert error.startswith('rs_relpose: error: ') and error.count('\n') == 1
         assert words in error
+
     return run
 
 

@@ -61,15 +61,16 @@ class Sent:
 
     time_ns: int
     taken_ns: int
-    stamp_ns: int   # without the fault
+    stamp_ns: int  # without the fault
     message: Any
 
 
 class Stream:
     """Plays phases of a bag's beginning, each good, then faulty, then good again."""
 
-    def __init__(self, messages: list[tuple[int, Any]], faults: list[Fault],
-                 first_stamp_ns: int) -> None:
+    def __init__(
+        self, messages: list[tuple[int, Any]], faults: list[Fault], first_stamp_ns: int
+    ) -> None:
         self.bag_start_ns, first = messages[0]
         # Of an image by its stamp as sent: stamp in the bag (None if of two images), and phase.
         self.taken_at: dict[int, int | None] = {}
@@ -89,31 +90,46 @@ class Stream:
             if seconds > PHASE:
                 break
             taken_ns = stamp_of(message)
-            out = with_stamp(message, taken_ns + round(
-                fault.jump * SECOND if seconds >= fault.begin else 0))
+            out = with_stamp(
+                message, taken_ns + round(fault.jump * SECOND if seconds >= fault.begin else 0)
+            )
             faulty = fault.begin <= seconds < FAULT_UNTIL
-            sent += [Sent(time_ns + round(delay * SECOND), taken_ns, stamp_of(out), item)
-                     for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)])]
+            sent += [
+                Sent(time_ns + round(delay * SECOND), taken_ns, stamp_of(out), item)
+                for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)])
+            ]
         return sorted(sent, key=lambda item: item.time_ns)
 
-    def play(self, publish: Callable[[int, Any], object], results: list[Any],
-             phases: range | None = None, enough: int = 2) -> None:
+    def play(
+        self,
+        publish: Callable[[int, Any], object],
+        results: list[Any],
+        phases: range | None = None,
+        enough: int = 2,
+    ) -> None:
         """Publish (number of the phase, message) of some phases, all by default.
 
         A phase ends once there are `enough` results with stamps of its good end.
         """
         for phase in range(len(self._phases)) if phases is None else phases:
             jump_ns, before = round(self._faults[phase].jump * SECOND), len(results)
-            begin_ns = (self._bag_first_ns + self._later_ns + jump_ns
-                        + round(FAULT_UNTIL * SECOND))
+            begin_ns = self._bag_first_ns + self._later_ns + jump_ns + round(FAULT_UNTIL * SECOND)
             # Delayed messages come later than the fault ends.
-            faulty_ns = max(item.time_ns for item in self._phases[phase] if item.taken_ns
-                            < self._bag_first_ns + FAULT_UNTIL * SECOND)
+            faulty_ns = max(
+                item.time_ns
+                for item in self._phases[phase]
+                if item.taken_ns < self._bag_first_ns + FAULT_UNTIL * SECOND
+            )
             started, last_ns = time.monotonic(), 0
             for item in self._phases[phase]:
-                if item.time_ns > faulty_ns and sum(
+                if (
+                    item.time_ns > faulty_ns
+                    and sum(
                         begin_ns <= stamp_of(result) <= begin_ns + SECOND
-                        for result in results[before:]) >= enough:
+                        for result in results[before:]
+                    )
+                    >= enough
+                ):
                     break
                 last_ns = item.time_ns
                 delay = started + last_ns / SECOND / FASTER - time.monotonic()
@@ -162,16 +178,24 @@ def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
 
 def drivers(graph: Graph, *kinds: type, best_effort: Collection[type] = ()) -> dict[type, Any]:
     """Subscribed publishers of a camera and an IMU by type of message, all by default."""
-    return {kind: graph.publisher(kind, topic, kind in best_effort)
-            for kind, topic in TOPIC_OF.items() if kind in (kinds or TOPIC_OF)}
+    return {
+        kind: graph.publisher(kind, topic, kind in best_effort)
+        for kind, topic in TOPIC_OF.items()
+        if kind in (kinds or TOPIC_OF)
+    }
 
 
 def play(publishers: dict[type, Any], messages: list[tuple[int, Any]], later: float = 0.0) -> None:
     """Publish at bag time the messages that have a publisher, their stamps `later` [s]."""
     publish_in_time(
-        (publishers[type(message)], bag_time_ns,
-         with_stamp(message, stamp_of(message) + round(later * SECOND)))
-        for bag_time_ns, message in messages if type(message) in publishers)
+        (
+            publishers[type(message)],
+            bag_time_ns,
+            with_stamp(message, stamp_of(message) + round(later * SECOND)),
+        )
+        for bag_time_ns, message in messages
+        if type(message) in publishers
+    )
 
 
 def stamp_of(message: Any) -> int:
@@ -188,6 +212,7 @@ def with_stamp(message: Any, new_stamp_ns: int) -> Any:
 
 # -- faults ----------------------------------------------------------------------------------
 
+
 def nothing(message: Any, _: float) -> Iterator[tuple[float, Any]]:
     """No fault."""
     yield 0.0, message
@@ -195,26 +220,32 @@ def nothing(message: Any, _: float) -> Iterator[tuple[float, Any]]:
 
 def without(kind: type, begin: float = 0.0, end: float = FAULT_UNTIL) -> Edit:
     """The driver of one kind of message stops."""
+
     def edit(message: Any, seconds: float) -> Iterator[tuple[float, Any]]:
         if not (isinstance(message, kind) and begin <= seconds < end):
             yield 0.0, message
+
     return edit
 
 
 def changed(kind: type, change: Callable[[Any], Any]) -> Edit:
     """Every message of one kind is changed in place, or replaced where `change` returns one."""
+
     def edit(message: Any, _: float) -> Iterator[tuple[float, Any]]:
         if isinstance(message, kind):
             own = copy.deepcopy(message)
             message = change(own) or own
         yield 0.0, message
+
     return edit
 
 
 def delayed(kind: type, delay: Callable[[], float]) -> Edit:
     """Every message of one kind comes later."""
+
     def edit(message: Any, _: float) -> Iterator[tuple[float, Any]]:
         yield delay() if isinstance(message, kind) else 0.0, message
+
     return edit
 
 
@@ -233,6 +264,7 @@ def first_ahead(kind: type, seconds: float) -> Edit:
             done.append(True)
             message = with_stamp(message, stamp_of(message) + round(seconds * SECOND))
         yield 0.0, message
+
     return edit
 
 
@@ -244,14 +276,17 @@ def every(kind: type, number: int) -> Edit:
         count[0] += isinstance(message, kind)
         if not isinstance(message, kind) or count[0] % number == 0:
             yield 0.0, message
+
     return edit
 
 
 def vector(name: str, **values: float) -> Callable[[Any], None]:
     """Set components of a vector of an Imu message."""
+
     def change(message: Imu) -> None:
         for axis, value in values.items():
             setattr(getattr(message, name), axis, value)
+
     return change
 
 
@@ -268,4 +303,5 @@ def repeating(part: Callable[[Any], Any], put: Callable[[Any, Any], Any]) -> Cal
         if not first:
             first.append(part(message))
         return put(message, first[0])
+
     return change

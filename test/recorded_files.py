@@ -28,19 +28,23 @@ def picture(number: int, width: int = 64, height: int = 48, *shape: int) -> byte
     return cv2.imencode('.jpg', pixels)[1].tobytes()
 
 
-def write_table(path: Path, header: str, rows: Sequence[Sequence[object]],
-                separator: str = ',') -> None:
+def write_table(
+    path: Path, header: str, rows: Sequence[Sequence[object]], separator: str = ','
+) -> None:
     path.write_text('\n'.join([header, *(separator.join(map(str, row)) for row in rows)]) + '\n')
 
 
 # --- damage
 
+
 def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
     """Replace the first place of a text, which must be there."""
+
     def damage(folder: Path) -> None:
         text = (folder / name).read_text()
         assert old in text
         (folder / name).write_text(text.replace(old, new, 1))
+
     return damage
 
 
@@ -52,6 +56,7 @@ def written(name: str, data: bytes) -> Callable[[Path], None]:
     def damage(folder: Path) -> None:
         assert (folder / name).is_file()
         (folder / name).write_bytes(data)
+
     return damage
 
 
@@ -96,10 +101,19 @@ def make_clip(folder: Path, tags: dict[str, str] | None = None, whole: bool = Tr
 def make_video(folder: Path, **header: object) -> Path:
     """A video with Gyroflow's log next to it."""
     path = make_clip(folder)
-    lines = ['GYROFLOW IMU LOG', 'version,1.3', 'id,Model_1', 'vendor,Acme', 'orientation,XYZ',
-             *(f'{name},{value}' for name, value in header.items()),
-             'tscale,0.001', 'gscale,1', 'ascale,1', 't,gx,gy,gz,ax,ay,az',
-             *(','.join(map(repr, (5 * k, *RATE, *FORCE_G))) for k in range(60))]
+    lines = [
+        'GYROFLOW IMU LOG',
+        'version,1.3',
+        'id,Model_1',
+        'vendor,Acme',
+        'orientation,XYZ',
+        *(f'{name},{value}' for name, value in header.items()),
+        'tscale,0.001',
+        'gscale,1',
+        'ascale,1',
+        't,gx,gy,gz,ax,ay,az',
+        *(','.join(map(repr, (5 * k, *RATE, *FORCE_G))) for k in range(60)),
+    ]
     path.with_suffix('.gcsv').write_text('\n'.join(lines) + '\n')
     return path
 
@@ -107,8 +121,12 @@ def make_video(folder: Path, **header: object) -> Path:
 def add_gopro_tags(path: Path, tags: dict[str, str], whole: bool) -> None:
     """Append GoPro's box of tags (GPMF), each a text."""
     entries = b''.join(
-        name.encode() + struct.pack('>cBH', b'c', 1, len(text)) + text.encode()
-        + b'\0' * (-len(text) % 4) for name, text in tags.items())
+        name.encode()
+        + struct.pack('>cBH', b'c', 1, len(text))
+        + text.encode()
+        + b'\0' * (-len(text) % 4)
+        for name, text in tags.items()
+    )
     # Four bytes that telemetry-parser passes over.
     entries = b'\0\0\0\0' + entries
     device = b'DEVC' + struct.pack('>BBH', 0, 1, len(entries)) + entries
@@ -124,7 +142,7 @@ def rotate_for_display(path: Path) -> None:
     identity = struct.pack('>9i', 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
     rotated = struct.pack('>9i', 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
     at = data.index(identity, data.index(b'tkhd'))
-    path.write_bytes(data[:at] + rotated + data[at + len(identity):])
+    path.write_bytes(data[:at] + rotated + data[at + len(identity) :])
 
 
 # --- phones
@@ -136,23 +154,43 @@ def make_posecam(folder: Path) -> Path:
     (folder / 'frames').mkdir(parents=True)
     for number in (0, 1, 3, 4):
         (folder / 'frames' / f'{number:06d}_{STAMPS[number]}.jpg').write_bytes(picture(number))
-    write_table(folder / 'poses.csv',
-                'frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image', [
-                    [number, stamp, *([''] * 7 if number == 1 else [
-                        0.1 * number, 0.2, 0.3, 0, 0, 0, 1]),
-                     'PAUSED:INSUFFICIENT_FEATURES' if number == 1 else 'TRACKING',
-                     'dropped:queue_full' if number == 2 else 'saved']
-                    for number, stamp in enumerate(STAMPS)])
-    write_table(folder / 'frame_metadata.csv', 'frame_index,timestamp_ns,exposure_time_ns,'
-                'rolling_shutter_skew_ns,ois_mode', [
-                    [number, stamp, 4_000_000 + number, '' if number == 0 else 21_500_000, 0]
-                    for number, stamp in enumerate(STAMPS)])
-    write_table(folder / 'imu.csv', 'timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z', [
-        row for stamp in IMU_STAMPS for row in (
-            [stamp, 'accel', 0.05, 9.8, 0.5, '', '', ''],
-            [stamp + 1_000_000, 'gyro_uncal', '-5.5E-4', 0.25, 0.5, 0.01, 0.02, -0.03])])
-    (folder / 'intrinsics.json').write_text(json.dumps(
-        {'width': 64, 'height': 48, 'fx': 50.5, 'fy': 51.5, 'cx': 32.5, 'cy': 23.5}))
+    write_table(
+        folder / 'poses.csv',
+        'frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image',
+        [
+            [
+                number,
+                stamp,
+                *([''] * 7 if number == 1 else [0.1 * number, 0.2, 0.3, 0, 0, 0, 1]),
+                'PAUSED:INSUFFICIENT_FEATURES' if number == 1 else 'TRACKING',
+                'dropped:queue_full' if number == 2 else 'saved',
+            ]
+            for number, stamp in enumerate(STAMPS)
+        ],
+    )
+    write_table(
+        folder / 'frame_metadata.csv',
+        'frame_index,timestamp_ns,exposure_time_ns,rolling_shutter_skew_ns,ois_mode',
+        [
+            [number, stamp, 4_000_000 + number, '' if number == 0 else 21_500_000, 0]
+            for number, stamp in enumerate(STAMPS)
+        ],
+    )
+    write_table(
+        folder / 'imu.csv',
+        'timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z',
+        [
+            row
+            for stamp in IMU_STAMPS
+            for row in (
+                [stamp, 'accel', 0.05, 9.8, 0.5, '', '', ''],
+                [stamp + 1_000_000, 'gyro_uncal', '-5.5E-4', 0.25, 0.5, 0.01, 0.02, -0.03],
+            )
+        ],
+    )
+    (folder / 'intrinsics.json').write_text(
+        json.dumps({'width': 64, 'height': 48, 'fx': 50.5, 'fy': 51.5, 'cx': 32.5, 'cy': 23.5})
+    )
     (folder / 'device.json').write_text(json.dumps({'camera': {'sensor_orientation_deg': 90}}))
     (folder / 'manifest.json').write_text(json.dumps({'pose_jumps': {'count': 0, 'jumps': []}}))
     return folder
@@ -162,23 +200,34 @@ def make_mars(folder: Path, clock: str = 'REALTIME', difference: int = 0) -> Pat
     folder.mkdir(parents=True)
     write_video(folder / 'movie.mp4', VIDEO_TICKS)
     camera = [stamp - difference for stamp in STAMPS]
-    write_table(folder / 'frame_timestamps.txt', 'Frame timestamp[nanosec],Unix time[nanosec]',
-                [[stamp, 1_600_000_000_000_000_000] for stamp in camera])
-    write_table(folder / 'gyro_accel.csv',
-                'Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2],'
-                'Unix time[nanosec]',
-                [[stamp, 0.1, -0.2, 0.3, 0.5, 9.8, 0.1, 1] for stamp in IMU_STAMPS])
-    write_table(folder / 'movie_metadata.csv',
-                'Timestamp[nanosec],fx[px],fy[px],Frame No.,Exposure time[nanosec],'
-                'Sensor frame duration[nanosec],Frame readout time[nanosec],ISO,Focal length,'
-                'Focus distance,AF mode,Unix time[nanosec]',
-                [[stamp, 60.5, 61.5, number, 10_000_000, 33_000_000, 18_000_000, 100, 4.3,
-                  'null', 1, 1] for number, stamp in enumerate(camera)])
-    write_table(folder / 'edge_epochs.txt',
-                '#Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_'
-                f'TIMESTAMP_SOURCE is SENSOR_INFO_TIMESTAMP_SOURCE_{clock}.\n#and more',
-                [[START, START - difference, difference],
-                 [START + 5, START - difference + 5, difference]], separator='\t')
+    write_table(
+        folder / 'frame_timestamps.txt',
+        'Frame timestamp[nanosec],Unix time[nanosec]',
+        [[stamp, 1_600_000_000_000_000_000] for stamp in camera],
+    )
+    write_table(
+        folder / 'gyro_accel.csv',
+        'Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2],'
+        'Unix time[nanosec]',
+        [[stamp, 0.1, -0.2, 0.3, 0.5, 9.8, 0.1, 1] for stamp in IMU_STAMPS],
+    )
+    write_table(
+        folder / 'movie_metadata.csv',
+        'Timestamp[nanosec],fx[px],fy[px],Frame No.,Exposure time[nanosec],'
+        'Sensor frame duration[nanosec],Frame readout time[nanosec],ISO,Focal length,'
+        'Focus distance,AF mode,Unix time[nanosec]',
+        [
+            [stamp, 60.5, 61.5, number, 10_000_000, 33_000_000, 18_000_000, 100, 4.3, 'null', 1, 1]
+            for number, stamp in enumerate(camera)
+        ],
+    )
+    write_table(
+        folder / 'edge_epochs.txt',
+        '#Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_'
+        f'TIMESTAMP_SOURCE is SENSOR_INFO_TIMESTAMP_SOURCE_{clock}.\n#and more',
+        [[START, START - difference, difference], [START + 5, START - difference + 5, difference]],
+        separator='\t',
+    )
     return folder
 
 
@@ -190,12 +239,21 @@ def make_tables(folder: Path, *, as_video: bool = False) -> Path:
     else:
         for number in range(len(STAMPS)):
             (folder / f'{number}.jpg').write_bytes(picture(number))
-        write_table(folder / 'frames.csv', 'frame,stamp_ns,file',
-                    [[number, stamp, f'{number}.jpg'] for number, stamp in enumerate(STAMPS)])
-    write_table(folder / 'gyro.csv', 'stamp_ns,x,y,z',
-                [[stamp, 0.1, -0.2, 0.3] for stamp in reversed(IMU_STAMPS)])
-    write_table(folder / 'accel.csv', 'stamp_ns,x,y,z',
-                [[stamp + 7, 0.1, 9.8, 0.3] for stamp in IMU_STAMPS])
+        write_table(
+            folder / 'frames.csv',
+            'frame,stamp_ns,file',
+            [[number, stamp, f'{number}.jpg'] for number, stamp in enumerate(STAMPS)],
+        )
+    write_table(
+        folder / 'gyro.csv',
+        'stamp_ns,x,y,z',
+        [[stamp, 0.1, -0.2, 0.3] for stamp in reversed(IMU_STAMPS)],
+    )
+    write_table(
+        folder / 'accel.csv',
+        'stamp_ns,x,y,z',
+        [[stamp + 7, 0.1, 9.8, 0.3] for stamp in IMU_STAMPS],
+    )
     return folder
 
 
@@ -210,16 +268,27 @@ def make_realsense(folder: Path) -> Path:
     (folder / 'camera.txt').write_text('60.5 61.5 32.25 24.75 0\n64 48\ncrop\n512 512\n')
     for number, stamp in enumerate(REALSENSE_STAMPS):
         (folder / 'images' / f'{stamp}.jpg').write_bytes(picture(number))
-    write_table(folder / 'frames.csv', 'segment,index_in_original,stamp_ns,dt_to_next_ms,file', [
-        ['A', number, stamp, 35.0, f'images/{stamp}.jpg']
-        for number, stamp in enumerate(REALSENSE_STAMPS)])
-    stamps = sorted([REALSENSE_START + k * 5 * MILLISECOND for k in range(1000)]
-                    + REALSENSE_STAMPS)
-    rows = [[stamp, f'{k * 1e-4:.6f}', -0.2, 0.3, 0.5, -9.8, -0.1]
-            for k, stamp in enumerate(stamps)]
+    write_table(
+        folder / 'frames.csv',
+        'segment,index_in_original,stamp_ns,dt_to_next_ms,file',
+        [
+            ['A', number, stamp, 35.0, f'images/{stamp}.jpg']
+            for number, stamp in enumerate(REALSENSE_STAMPS)
+        ],
+    )
+    stamps = sorted(
+        [REALSENSE_START + k * 5 * MILLISECOND for k in range(1000)] + REALSENSE_STAMPS
+    )
+    rows = [
+        [stamp, f'{k * 1e-4:.6f}', -0.2, 0.3, 0.5, -9.8, -0.1] for k, stamp in enumerate(stamps)
+    ]
     # One line twice, and two in the wrong order.
-    write_table(folder / 'imu.txt', '# timestamp[ns] w a',
-                [*rows[:11], rows[10], rows[12], rows[11], *rows[13:]], separator=' ')
+    write_table(
+        folder / 'imu.txt',
+        '# timestamp[ns] w a',
+        [*rows[:11], rows[10], rows[12], rows[11], *rows[13:]],
+        separator=' ',
+    )
     return folder
 
 

@@ -19,26 +19,38 @@ from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.tracking.features import Matches
 
 SCENE_CAMERA = {
-    'width': VIEW.width, 'height': VIEW.height, 'fx': problems.FOCAL, 'fy': problems.FOCAL,
-    'cx': problems.CENTRE_U, 'cy': problems.CENTRE_V,
-    'readout_time': VIEW.height * VIEW.line_delay}
+    'width': VIEW.width,
+    'height': VIEW.height,
+    'fx': problems.FOCAL,
+    'fy': problems.FOCAL,
+    'cx': problems.CENTRE_U,
+    'cy': problems.CENTRE_V,
+    'readout_time': VIEW.height * VIEW.line_delay,
+}
 
 
 def estimate_scene(scene, config, gravity=True, camera=(), **arguments):
     """`camera`: what differs from the camera of the scene."""
     return estimate_relative_pose(
-        scene.points1, scene.points2, RollingShutterCamera(**SCENE_CAMERA | dict(camera)),
+        scene.points1,
+        scene.points2,
+        RollingShutterCamera(**SCENE_CAMERA | dict(camera)),
         FrameMotion(scene.measured_rate1, scene.measured_gravity1 if gravity else None),
         FrameMotion(scene.measured_rate2, scene.measured_gravity2 if gravity else None),
-        config=config, **arguments)
+        config=config,
+        **arguments,
+    )
 
 
-VELOCITY = np.array([0.8, -0.3, 1.5])   # m/s, in the world
+VELOCITY = np.array([0.8, -0.3, 1.5])  # m/s, in the world
 # Of the keyframes [s]: unequal, so that each baseline is of another length.
 TIMES = (0.0, 0.2, 0.5, 0.6, 1.0)
 # Pinhole of the scene; points outside of the image count as well.
-_INTRINSICS = Intrinsics(image_width=1920, image_height=1080, **{
-    key: value for key, value in SCENE_CAMERA.items() if key != 'readout_time'})
+_INTRINSICS = Intrinsics(
+    image_width=1920,
+    image_height=1080,
+    **{key: value for key, value in SCENE_CAMERA.items() if key != 'readout_time'},
+)
 _CAMERA = _INTRINSICS.global_shutter_camera()
 SENSOR = Sensor(_CAMERA, _INTRINSICS, ImageClock(_CAMERA))
 START_NS = 1_700_000_000_900_000_000
@@ -69,13 +81,17 @@ class Keyframe:
         self.tau = self.pixels[:, 1] * VIEW.line_delay
         local = motion(world, self.tau)
         self.rays = Rotation.from_rotvec(self.tau[:, None] * self.rate).apply(
-            local / np.linalg.norm(local, axis=1, keepdims=True))
+            local / np.linalg.norm(local, axis=1, keepdims=True)
+        )
         self.points = self.rotation.inv().apply(world - self.position)
 
 
-def simulated_flight(seed: int, points: int = 120,
-                     tracks: Iterable[NDArray[np.int64]] | None = None,
-                     places: Sequence[float] = TIMES) -> Flight:
+def simulated_flight(
+    seed: int,
+    points: int = 120,
+    tracks: Iterable[NDArray[np.int64]] | None = None,
+    places: Sequence[float] = TIMES,
+) -> Flight:
     """`tracks`: which points are matched, for each pair; all of them by default.
 
     `places`: time of the position of each keyframe [s]; a pair with equal times is a pure
@@ -93,24 +109,51 @@ def simulated_flight(seed: int, points: int = 120,
         # Shuffled: only the ids identify the tracks.
         use = rng.permutation(use)
         pose = RelativePose(
-            status=Status.OK, R=(a.rotation.inv() * b.rotation).as_matrix(),
-            angular_velocity2=b.rate, inliers=np.ones(len(use), dtype=bool),
-            covariance=1e-6 * np.eye(6), velocity_covariance=1e-4 * np.eye(6), model='uniform')
+            status=Status.OK,
+            R=(a.rotation.inv() * b.rotation).as_matrix(),
+            angular_velocity2=b.rate,
+            inliers=np.ones(len(use), dtype=bool),
+            covariance=1e-6 * np.eye(6),
+            velocity_covariance=1e-4 * np.eye(6),
+            model='uniform',
+        )
         if length > 0.0:
-            pose = replace(pose, t=t / length, linear_velocity1=a.velocity / length,
-                           linear_velocity2=b.velocity / length)
+            pose = replace(
+                pose,
+                t=t / length,
+                linear_velocity1=a.velocity / length,
+                linear_velocity2=b.velocity / length,
+            )
         else:
             pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
-        matches = Matches(use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use],
-                          np.ones(len(use)))
-        true_landmarks.append(Landmarks(
-            VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use]))
+        matches = Matches(
+            use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use], np.ones(len(use))
+        )
+        true_landmarks.append(
+            Landmarks(VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use])
+        )
         rows = a.rays[use], b.rays[use], a.tau[use], b.tau[use]
         points = cache(partial(landmarks, pose, *rows, SENSOR.camera))
-        stamps = [START_NS + round(1e9 * time) for time in TIMES[k:k + 2]]
-        pairs.append(PairResult(
-            *stamps, *stamps, 'camera', TIMES[k + 1] - TIMES[k], pose, matches, *rows[2:],
-            *rows[:2], 10.0, points if pose else None))
+        stamps = [START_NS + round(1e9 * time) for time in TIMES[k : k + 2]]
+        pairs.append(
+            PairResult(
+                *stamps,
+                *stamps,
+                'camera',
+                TIMES[k + 1] - TIMES[k],
+                pose,
+                matches,
+                *rows[2:],
+                *rows[:2],
+                10.0,
+                points if pose else None,
+            )
+        )
     positions = np.array([first.rotation.inv().apply(f.position - first.position) for f in frames])
-    return Flight(pairs, positions, [(first.rotation.inv() * f.rotation).as_matrix()
-                                     for f in frames], np.array(baselines), true_landmarks)
+    return Flight(
+        pairs,
+        positions,
+        [(first.rotation.inv() * f.rotation).as_matrix() for f in frames],
+        np.array(baselines),
+        true_landmarks,
+    )

@@ -33,8 +33,14 @@ def check_content(bag: Bag) -> None:
     assert topics.truth is not None and topics.truth.msgtype == POSE
     read = list(bag.messages([topics.image, topics.camera_info, topics.imu, topics.truth]))
     assert [(m.topic, m.bag_time_ns - STAMP_NS) for m in read] == [
-        ('/imu', 1), ('/camera/camera_info', 2), ('/imu', 3), ('/camera/image_raw', 4),
-        ('/imu', 5), ('/ground_truth/pose', 6), ('/imu', 7)]
+        ('/imu', 1),
+        ('/camera/camera_info', 2),
+        ('/imu', 3),
+        ('/camera/image_raw', 4),
+        ('/imu', 5),
+        ('/ground_truth/pose', 6),
+        ('/imu', 7),
+    ]
     for message in read:
         stamp = message.message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == message.bag_time_ns
@@ -51,10 +57,13 @@ def check_content(bag: Bag) -> None:
 
 # --- storages
 
+
 @pytest.mark.parametrize('kind', bag_kinds.KINDS)
 def test_every_storage_gives_the_same(tmp_path, kind):
-    expected = {STAMP_NS + time: bytes(JAZZY.serialize_cdr(message, msgtype))
-                for _, msgtype, message, time in bag_kinds.camera_messages()}
+    expected = {
+        STAMP_NS + time: bytes(JAZZY.serialize_cdr(message, msgtype))
+        for _, msgtype, message, time in bag_kinds.camera_messages()
+    }
     bag = write_kind(kind, tmp_path)
     with open_bag(bag) as opened:
         check_content(opened)
@@ -75,10 +84,21 @@ def test_a_type_of_ros_1_alone_cannot_be_published(tmp_path):
     with Ros1Writer(tmp_path / 'a.bag') as writer:
         log = NOETIC.types['rosgraph_msgs/msg/Log']
         stamp = NOETIC.types['builtin_interfaces/msg/Time'](sec=1, nanosec=2)
-        message = log(header=NOETIC.types['std_msgs/msg/Header'](0, stamp, ''), level=1, name='n',
-                      msg='m', file='f', function='g', line=3, topics=[])
-        writer.write(writer.add_connection('/rosout', log.__msgtype__, typestore=NOETIC), 5,
-                     NOETIC.serialize_ros1(message, log.__msgtype__))
+        message = log(
+            header=NOETIC.types['std_msgs/msg/Header'](0, stamp, ''),
+            level=1,
+            name='n',
+            msg='m',
+            file='f',
+            function='g',
+            line=3,
+            topics=[],
+        )
+        writer.write(
+            writer.add_connection('/rosout', log.__msgtype__, typestore=NOETIC),
+            5,
+            NOETIC.serialize_ros1(message, log.__msgtype__),
+        )
     with open_bag(tmp_path / 'a.bag') as bag, pytest.raises(InputError, match='leave it out'):
         list(bag.raw_messages(bag.topics))
 
@@ -93,8 +113,11 @@ def topics_bag(folder: Path, *topics: tuple[str, str]) -> Path:
     """A bag with a message on each of `topics` (name, type)."""
     by_type = {msgtype: message for _, msgtype, message, _ in bag_kinds.camera_messages()}
     by_type[COMPRESSED] = build.compressed(build.rosbags_types, b'')
-    return write_kind('mcap', folder, [(name, msgtype, by_type[msgtype], time)
-                                       for time, (name, msgtype) in enumerate(topics)])
+    return write_kind(
+        'mcap',
+        folder,
+        [(name, msgtype, by_type[msgtype], time) for time, (name, msgtype) in enumerate(topics)],
+    )
 
 
 def test_progress_counts_the_messages_that_are_read(tmp_path):
@@ -109,12 +132,16 @@ def test_progress_counts_the_messages_that_are_read(tmp_path):
 def found(path: Path, **options: str) -> dict[str, str]:
     with open_bag(path) as bag:
         topics = bag.find_topics(options)
-    return {role: topic.name for role in ('image', 'camera_info', 'imu', 'accel', 'truth')
-            if (topic := getattr(topics, role)) is not None}
+    return {
+        role: topic.name
+        for role in ('image', 'camera_info', 'imu', 'accel', 'truth')
+        if (topic := getattr(topics, role)) is not None
+    }
 
 
-def check_refusal(path: Path, kind: type[RsRelposeError], words: tuple[str, ...],
-                  **options: str) -> None:
+def check_refusal(
+    path: Path, kind: type[RsRelposeError], words: tuple[str, ...], **options: str
+) -> None:
     with pytest.raises(RsRelposeError) as caught:
         found(path, **options)
     assert type(caught.value) is kind
@@ -124,42 +151,85 @@ def check_refusal(path: Path, kind: type[RsRelposeError], words: tuple[str, ...]
 
 def test_realsense_publishes_gyro_and_accelerometer_separately(tmp_path):
     path = topics_bag(
-        tmp_path, ('/camera/accel/sample', IMU), ('/camera/gyro/sample', IMU),
+        tmp_path,
+        ('/camera/accel/sample', IMU),
+        ('/camera/gyro/sample', IMU),
         ('/camera/color/image_raw/compressed', COMPRESSED),
-        ('/camera/color/camera_info', INFO), ('/camera/depth/camera_info', INFO))
+        ('/camera/color/camera_info', INFO),
+        ('/camera/depth/camera_info', INFO),
+    )
     assert found(path) == {
-        'image': '/camera/color/image_raw/compressed', 'camera_info': '/camera/color/camera_info',
-        'imu': '/camera/gyro/sample', 'accel': '/camera/accel/sample'}
+        'image': '/camera/color/image_raw/compressed',
+        'camera_info': '/camera/color/camera_info',
+        'imu': '/camera/gyro/sample',
+        'accel': '/camera/accel/sample',
+    }
     gyro_only = found(path, imu='/camera/gyro/sample')
     assert gyro_only['imu'] == '/camera/gyro/sample' and 'accel' not in gyro_only
     assert found(path, accel='/camera/accel/sample') == found(path)
 
 
-SEVERAL = (('/left', IMAGE), ('/right', IMAGE), ('/a/info', INFO), ('/b/info', INFO),
-           ('/imu0', IMU), ('/imu1', IMU))
+SEVERAL = (
+    ('/left', IMAGE),
+    ('/right', IMAGE),
+    ('/a/info', INFO),
+    ('/b/info', INFO),
+    ('/imu0', IMU),
+    ('/imu1', IMU),
+)
 
 
 def test_a_choice_among_several_with_or_without_the_slash(tmp_path):
-    path, chosen = topics_bag(tmp_path, *SEVERAL), {
-        'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'}
+    path, chosen = (
+        topics_bag(tmp_path, *SEVERAL),
+        {'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'},
+    )
     assert found(path, **chosen) == chosen
     assert found(path, **{role: name[1:] for role, name in chosen.items()}) == chosen
 
 
-@pytest.mark.parametrize('topics, options, kind, words', [
-    (SEVERAL, {}, InputError, ('--image-topic', '/left', '/right', IMAGE)),
-    (SEVERAL, {'image': '/left', 'imu': '/imu0'}, InputError,
-     ('--camera-info-topic', '/a/info', '/b/info')),
-    (SEVERAL, {'image': '/left', 'camera_info': '/a/info'}, InputError,
-     ('--imu-topic', '--accel-topic', '/imu0', '/imu1')),
-    *((SENSORS[:k] + SENSORS[k + 1:], {}, MissingInputError, (
-        f'has no {name} topic', *(f'{other} ({msgtype})' for other, msgtype in (
-            SENSORS[:k] + SENSORS[k + 1:]))))
-      for k, name in enumerate(('image', 'CameraInfo', 'IMU'))),
-    (SENSORS, {'image': '/picture'}, MissingInputError, ('/picture', '--image-topic', '/image')),
-    (SENSORS, {'imu': '/info'}, InputError, ('/info', '--imu-topic', IMU, INFO)),
-    (SENSORS, {'truth': '/imu'}, InputError, (POSE, '--truth-topic')),
-    ((('/image_rect', IMAGE), *SENSORS[1:]), {}, InputError, ('rectified',))])
+@pytest.mark.parametrize(
+    'topics, options, kind, words',
+    [
+        (SEVERAL, {}, InputError, ('--image-topic', '/left', '/right', IMAGE)),
+        (
+            SEVERAL,
+            {'image': '/left', 'imu': '/imu0'},
+            InputError,
+            ('--camera-info-topic', '/a/info', '/b/info'),
+        ),
+        (
+            SEVERAL,
+            {'image': '/left', 'camera_info': '/a/info'},
+            InputError,
+            ('--imu-topic', '--accel-topic', '/imu0', '/imu1'),
+        ),
+        *(
+            (
+                SENSORS[:k] + SENSORS[k + 1 :],
+                {},
+                MissingInputError,
+                (
+                    f'has no {name} topic',
+                    *(
+                        f'{other} ({msgtype})'
+                        for other, msgtype in (SENSORS[:k] + SENSORS[k + 1 :])
+                    ),
+                ),
+            )
+            for k, name in enumerate(('image', 'CameraInfo', 'IMU'))
+        ),
+        (
+            SENSORS,
+            {'image': '/picture'},
+            MissingInputError,
+            ('/picture', '--image-topic', '/image'),
+        ),
+        (SENSORS, {'imu': '/info'}, InputError, ('/info', '--imu-topic', IMU, INFO)),
+        (SENSORS, {'truth': '/imu'}, InputError, (POSE, '--truth-topic')),
+        ((('/image_rect', IMAGE), *SENSORS[1:]), {}, InputError, ('rectified',)),
+    ],
+)
 def test_topics_that_cannot_be_used(tmp_path, topics, options, kind, words):
     """Several candidates are listed with their option, and for an absent topic all there are."""
     check_refusal(topics_bag(tmp_path, *topics), kind, words, **options)
@@ -186,17 +256,20 @@ def test_topics_without_messages(tmp_path):
 
 # --- what is no bag, or not a complete one
 
+
 def recorder_killed(folder: Path) -> Path:
     bag = write_kind('mcap', folder)
     (bag / 'metadata.yaml').unlink()
     return bag
 
 
-def file_of(name: str, data: bytes = np.random.default_rng(1).bytes(4096)
-            ) -> Callable[[Path], Path]:
+def file_of(
+    name: str, data: bytes = np.random.default_rng(1).bytes(4096)
+) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         (folder / name).write_bytes(data)
         return folder / name
+
     return make
 
 
@@ -204,8 +277,9 @@ def truncated(kind: str, keep: float) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         bag = write_kind(kind, folder)
         data = storage_file(bag).read_bytes()
-        storage_file(bag).write_bytes(data[:int(keep * len(data))])
+        storage_file(bag).write_bytes(data[: int(keep * len(data))])
         return bag
+
     return make
 
 
@@ -216,6 +290,7 @@ def metadata(change: Callable[[str], str]) -> Callable[[Path], Path]:
         assert change(text) != text
         (bag / 'metadata.yaml').write_text(change(text))
         return bag
+
     return make
 
 
@@ -226,8 +301,10 @@ def metadata_with(old: str, new: str) -> Callable[[Path], Path]:
 def aliases_of_aliases(_: str) -> str:
     """Printed in an error they would have no end."""
     laughs = ''.join(f'l{k + 1}: &l{k + 1} [{", ".join([f"*l{k}"] * 9)}]\n' for k in range(12))
-    return (f'l0: &l0 ha\n{laughs}rosbag2_bagfile_information: {{version: 9, '
-            'relative_file_paths: [], storage_identifier: *l12}')
+    return (
+        f'l0: &l0 ha\n{laughs}rosbag2_bagfile_information: {{version: 9, '
+        'relative_file_paths: [], storage_identifier: *l12}'
+    )
 
 
 def no_storage(folder: Path) -> Path:
@@ -239,29 +316,42 @@ def no_storage(folder: Path) -> Path:
 SUFFIXES = 'mcap', 'db3', 'bag'
 
 
-@pytest.mark.parametrize('make, kind, words', [
-    (lambda folder: folder / 'absent', MissingInputError, 'there is no bag'),
-    (lambda folder: folder, InputError, 'is no bag: it has no metadata.yaml'),
-    (recorder_killed, InputError, 'not stopped properly'),
-    (file_of('notes.txt'), InputError, 'is no bag: give'),
-    *((file_of(f'a.{suffix}', b''), InputError, 'is truncated') for suffix in SUFFIXES),
-    *((file_of(f'a.{suffix}'), InputError, 'or no bag') for suffix in SUFFIXES),
-    *((truncated(*cut), InputError, 'if it is truncated, copy it again, or "mcap recover ')
-      for cut in (('mcap', 0.9), ('mcap', 0.5), ('mcap', 0.01), ('mcap_zstd_chunks', 0.5))),
-    *((truncated(kind, 0.5), InputError, 'is damaged') for kind in (
-        'mcap_zstd_files', 'sqlite3', 'sqlite3_zstd_files')),
-    *((truncated(*cut), InputError, 'is truncated or damaged') for cut in (
-        ('ros1', 0.7), ('ros1', 0.3), ('ros1_lz4', 0.3))),
-    (metadata(lambda _: ''), InputError, 'is damaged'),
-    (metadata(lambda _: 'a: [1'), InputError, 'is damaged'),
-    (metadata(lambda _: 'rosbag2_bagfile_information: {version: 99}'), InputError, 'is damaged'),
-    (metadata(aliases_of_aliases), InputError, 'YAML aliases'),
-    (metadata(lambda _: '#' * (2**24 + 1)), InputError, 'more than 16777216 bytes'),
-    (metadata_with('message_count: 4', 'message_count: many'), InputError, 'is damaged'),
-    (metadata_with('name: /imu', 'name: 17'), InputError, 'is damaged'),
-    (metadata_with('name: /imu', 'name: "/im\\nu"'), InputError, 'is damaged'),
-    (no_storage, InputError, 'is damaged'),
-])
+@pytest.mark.parametrize(
+    'make, kind, words',
+    [
+        (lambda folder: folder / 'absent', MissingInputError, 'there is no bag'),
+        (lambda folder: folder, InputError, 'is no bag: it has no metadata.yaml'),
+        (recorder_killed, InputError, 'not stopped properly'),
+        (file_of('notes.txt'), InputError, 'is no bag: give'),
+        *((file_of(f'a.{suffix}', b''), InputError, 'is truncated') for suffix in SUFFIXES),
+        *((file_of(f'a.{suffix}'), InputError, 'or no bag') for suffix in SUFFIXES),
+        *(
+            (truncated(*cut), InputError, 'if it is truncated, copy it again, or "mcap recover ')
+            for cut in (('mcap', 0.9), ('mcap', 0.5), ('mcap', 0.01), ('mcap_zstd_chunks', 0.5))
+        ),
+        *(
+            (truncated(kind, 0.5), InputError, 'is damaged')
+            for kind in ('mcap_zstd_files', 'sqlite3', 'sqlite3_zstd_files')
+        ),
+        *(
+            (truncated(*cut), InputError, 'is truncated or damaged')
+            for cut in (('ros1', 0.7), ('ros1', 0.3), ('ros1_lz4', 0.3))
+        ),
+        (metadata(lambda _: ''), InputError, 'is damaged'),
+        (metadata(lambda _: 'a: [1'), InputError, 'is damaged'),
+        (
+            metadata(lambda _: 'rosbag2_bagfile_information: {version: 99}'),
+            InputError,
+            'is damaged',
+        ),
+        (metadata(aliases_of_aliases), InputError, 'YAML aliases'),
+        (metadata(lambda _: '#' * (2**24 + 1)), InputError, 'more than 16777216 bytes'),
+        (metadata_with('message_count: 4', 'message_count: many'), InputError, 'is damaged'),
+        (metadata_with('name: /imu', 'name: 17'), InputError, 'is damaged'),
+        (metadata_with('name: /imu', 'name: "/im\\nu"'), InputError, 'is damaged'),
+        (no_storage, InputError, 'is damaged'),
+    ],
+)
 def test_bad_bags_are_refused_in_one_line(tmp_path, make, kind, words):
     path = make(tmp_path)
     with pytest.raises(RsRelposeError) as caught:
@@ -285,9 +375,13 @@ def array_longer_than_its_message(message: object, msgtype: str) -> bytes:
     return data
 
 
-@pytest.mark.parametrize('serialize, text', [
-    (first_bytes, f'a message of /imu in .* is corrupt, it is no {IMU}'),
-    (array_longer_than_its_message, r'a message of /camera/image_raw in .* is corrupt')])
+@pytest.mark.parametrize(
+    'serialize, text',
+    [
+        (first_bytes, f'a message of /imu in .* is corrupt, it is no {IMU}'),
+        (array_longer_than_its_message, r'a message of /camera/image_raw in .* is corrupt'),
+    ],
+)
 def test_a_corrupt_message_names_its_topic(tmp_path, serialize, text):
     with pytest.raises(InputError, match=text):
         read_all(write_kind('mcap', tmp_path, serialize=serialize))
@@ -299,9 +393,16 @@ def test_a_corrupt_message_names_its_topic(tmp_path, serialize, text):
 EXPRESSIONS = ['const unsigned long X = 1 << 80000000000;', f'const long X = {"(" * 9}1{")" * 9};']
 
 
-@pytest.mark.parametrize('definition', [
-    *(f'module a {{ module msg {{ {line} struct B {{ long y; }}; }}; }};' for line in EXPRESSIONS),
-    '((('])
+@pytest.mark.parametrize(
+    'definition',
+    [
+        *(
+            f'module a {{ module msg {{ {line} struct B {{ long y; }}; }}; }};'
+            for line in EXPRESSIONS
+        ),
+        '(((',
+    ],
+)
 @pytest.mark.timeout(30)
 def test_a_definition_is_not_read(tmp_path, definition):
     """Also that of an unused topic would have made the bag unreadable."""
@@ -309,7 +410,8 @@ def test_a_definition_is_not_read(tmp_path, definition):
     with sqlite3.connect(storage_file(bag)) as base:
         changed = base.execute(
             "UPDATE message_definitions SET encoding = 'ros2idl', encoded_message_definition = ?",
-            (definition,)).rowcount
+            (definition,),
+        ).rowcount
     base.close()
     assert changed == 4
     assert len(read_all(bag)) == 7
@@ -341,16 +443,21 @@ def test_a_definition_of_ros_1_that_takes_any_time_or_memory(tmp_path):
 
 # --- bounded sizes
 
-@pytest.mark.parametrize('kind, limit, text', [
-    ('mcap', 'MAX_MESSAGE_BYTES', 'at most 1048576 are read'),
-    ('sqlite3_zstd_messages', 'MAX_MESSAGE_BYTES', 'decompress to more than 1048576'),
-    ('mcap_zstd_messages', 'MAX_MESSAGE_BYTES', 'decompress to more than 1048576'),
-    ('mcap_zstd_chunks', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
-    ('ros1_lz4', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
-    ('ros1_bz2', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
-    # And 200 times the size of the file, some MB here.
-    ('sqlite3_zstd_files', 'MAX_FILE_BYTES', r'decompress to more than \d+$'),
-    ('mcap_zstd_files', 'MAX_FILE_BYTES', r'decompress to more than \d+$')])
+
+@pytest.mark.parametrize(
+    'kind, limit, text',
+    [
+        ('mcap', 'MAX_MESSAGE_BYTES', 'at most 1048576 are read'),
+        ('sqlite3_zstd_messages', 'MAX_MESSAGE_BYTES', 'decompress to more than 1048576'),
+        ('mcap_zstd_messages', 'MAX_MESSAGE_BYTES', 'decompress to more than 1048576'),
+        ('mcap_zstd_chunks', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
+        ('ros1_lz4', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
+        ('ros1_bz2', 'MAX_CHUNK_BYTES', 'decompress to more than 1048576'),
+        # And 200 times the size of the file, some MB here.
+        ('sqlite3_zstd_files', 'MAX_FILE_BYTES', r'decompress to more than \d+$'),
+        ('mcap_zstd_files', 'MAX_FILE_BYTES', r'decompress to more than \d+$'),
+    ],
+)
 def test_decompression_is_bounded(tmp_path, monkeypatch, kind, limit, text):
     """A bag of some kB with a compressed message or chunk that has many MB."""
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'temporary'))
@@ -369,8 +476,10 @@ def test_a_chunk_never_becomes_larger_than_its_head_has_it():
     """The head is checked before, so no larger chunk may follow it."""
     with pytest.raises(InputError, match='decompress to more than 100'):
         storage_mcap.DECOMPRESSORS['zstd'](storage_mcap.zstd.compress(bytes(10**8)), 100)
-    for name, data in (('zstd', storage_mcap.zstd.compress(bytes(100))),
-                       ('lz4', lz4.frame.compress(bytes(100)))):
+    for name, data in (
+        ('zstd', storage_mcap.zstd.compress(bytes(100))),
+        ('lz4', lz4.frame.compress(bytes(100))),
+    ):
         assert storage_mcap.DECOMPRESSORS[name](data, 100) == bytes(100)
         with pytest.raises(InputError, match='incomplete'):
             storage_mcap.DECOMPRESSORS[name](data[:-6], 100)

@@ -26,7 +26,7 @@ pytest.importorskip('distributed', reason='needs the extra batch')
 pytestmark = pytest.mark.timeout(300)
 
 VERSION = batch.package_version()
-SECONDS = 1.6   # of a bag
+SECONDS = 1.6  # of a bag
 
 
 def make_bag(path: Path, size: int = 10) -> Path:
@@ -53,10 +53,14 @@ def test_bags_of_paths_and_globs(tmp_path, monkeypatch):
     assert relative.changed_ns == 4_000_000_000_000_000_000
 
 
-@pytest.mark.parametrize('paths, names', [
-    (['/a/x', '/a/y.bag'], ['x', 'y']),
-    (['/a/x', '/b/x', '/b/y'], ['a__x', 'b__x', 'b__y']),
-    (['/a/x', '/a/x.mcap'], ['x', 'x.mcap'])])
+@pytest.mark.parametrize(
+    'paths, names',
+    [
+        (['/a/x', '/a/y.bag'], ['x', 'y']),
+        (['/a/x', '/b/x', '/b/y'], ['a__x', 'b__x', 'b__y']),
+        (['/a/x', '/a/x.mcap'], ['x', 'x.mcap']),
+    ],
+)
 def test_names_of_results_differ(paths, names):
     assert batch.unique_names(paths) == names
 
@@ -70,9 +74,15 @@ def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state)
     assert (tmp_path / 'a' / 'in' / 'it.txt').read_bytes() == b'text'
     lasts = state in (DONE, batch.FINDINGS, batch.REFUSED)
     assert batch.earlier(job, tmp_path) == (row if lasts else None)
-    for changes in ({'bag': bag._replace(size=6)}, {'bag': bag._replace(changed_ns=8)},
-                    {'bag': bag._replace(parameters='a: 2\n')}, {'options': ()},
-                    {'version': '2'}, {'command': 'replay'}, {'name': 'b'}):
+    for changes in (
+        {'bag': bag._replace(size=6)},
+        {'bag': bag._replace(changed_ns=8)},
+        {'bag': bag._replace(parameters='a: 2\n')},
+        {'options': ()},
+        {'version': '2'},
+        {'command': 'replay'},
+        {'name': 'b'},
+    ):
         assert batch.earlier(job._replace(**changes), tmp_path) is None
     (tmp_path / 'a' / 'check.json').unlink()
     assert batch.earlier(job, tmp_path) is None
@@ -93,42 +103,65 @@ def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
     assert not (tmp_path / file).exists()
 
 
-@pytest.mark.parametrize('values, sigmas, mean, sigma, chi2, outliers', [
-    # Bevington, Data Reduction, section 4.1: weights 1 / sigma^2; the sigma is 1 / (1 + 1/4) times
-    # the scatter of one degree of freedom.
-    ([10.0, 13.0], [1.0, 2.0], 10.6, math.sqrt(0.8 * 1.8), 1.8, ()),
-    ([10.0, 10.5], [1.0, 2.0], 10.1, math.sqrt(0.8), 0.05, ()),
-    ([1.0, 1.1, 0.9, 5.0, 1.0, -3.0], [0.1] * 6, 1.0, 0.05, 2.0, ('d', 'f')),
-    # 3.3 sigma from the others, but 2.7 of the difference.
-    ([0.0, 0.0, 0.33], [0.1] * 3, 0.11, 0.11, 7.26, ()),
-    # Of two that disagree, neither is known to be wrong: the sigma grows.
-    ([1.0, 2.0], [0.1, 0.1], 1.5, 0.5, 50.0, ())])
+@pytest.mark.parametrize(
+    'values, sigmas, mean, sigma, chi2, outliers',
+    [
+        # Bevington, Data Reduction, section 4.1: weights 1 / sigma^2; the sigma is 1 / (1 + 1/4)
+        # times
+        # the scatter of one degree of freedom.
+        ([10.0, 13.0], [1.0, 2.0], 10.6, math.sqrt(0.8 * 1.8), 1.8, ()),
+        ([10.0, 10.5], [1.0, 2.0], 10.1, math.sqrt(0.8), 0.05, ()),
+        ([1.0, 1.1, 0.9, 5.0, 1.0, -3.0], [0.1] * 6, 1.0, 0.05, 2.0, ('d', 'f')),
+        # 3.3 sigma from the others, but 2.7 of the difference.
+        ([0.0, 0.0, 0.33], [0.1] * 3, 0.11, 0.11, 7.26, ()),
+        # Of two that disagree, neither is known to be wrong: the sigma grows.
+        ([1.0, 2.0], [0.1, 0.1], 1.5, 0.5, 50.0, ()),
+    ],
+)
 def test_weighted_mean(values, sigmas, mean, sigma, chi2, outliers):
-    combined = batch.weighted_mean('x', 'abcdef'[:len(values)], values, sigmas)
+    combined = batch.weighted_mean('x', 'abcdef'[: len(values)], values, sigmas)
     assert [combined[key] for key in ('mean', 'sigma', 'chi2')] == pytest.approx(
-        [mean, sigma, chi2])
+        [mean, sigma, chi2]
+    )
     assert combined['outliers'] == list(outliers)
     assert combined['degrees_of_freedom'] == len(values) - len(outliers) - 1
 
 
 def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> dict:
     """Columns of what `calibrate` writes."""
+
     def estimate(value: float, observed: bool = True) -> dict:
         return {'value': value, 'sigma': 0.0002, 'observable': observed, 'remark': 'turn more'}
-    return batch.metrics_of('calibrate', {
-        'shutter': 'rolling', 'readout_time_s': estimate(readout, observable),
-        'time_offset_s': estimate(-0.01), 'focal_px': None,
-        'gyro_bias_rad_per_s': [estimate(0.001 * k) for k in range(3)],
-        'quat_cam_imu_xyzw': [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
-        'rotation_sigma_rad': [0.001] * 3, 'rotation_from_axis_map_rad': estimate(0.0),
-        'frames': 100, 'pixel_sigma': 0.1})
+
+    return batch.metrics_of(
+        'calibrate',
+        {
+            'shutter': 'rolling',
+            'readout_time_s': estimate(readout, observable),
+            'time_offset_s': estimate(-0.01),
+            'focal_px': None,
+            'gyro_bias_rad_per_s': [estimate(0.001 * k) for k in range(3)],
+            'quat_cam_imu_xyzw': [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
+            'rotation_sigma_rad': [0.001] * 3,
+            'rotation_from_axis_map_rad': estimate(0.0),
+            'frames': 100,
+            'pixel_sigma': 0.1,
+        },
+    )
 
 
 def test_calibrations_of_one_camera():
-    one_camera = batch.combine([{'name': name, **metrics} for name, metrics in {
-        'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
-        'c': calibration(0.0301, yaw=0.011),
-        'd': calibration(0.9, observable=False, yaw=0.011)}.items()])
+    one_camera = batch.combine(
+        [
+            {'name': name, **metrics}
+            for name, metrics in {
+                'a': calibration(0.0300, yaw=0.01),
+                'b': calibration(0.0302, yaw=0.012),
+                'c': calibration(0.0301, yaw=0.011),
+                'd': calibration(0.9, observable=False, yaw=0.011),
+            }.items()
+        ]
+    )
     combined = {one['figure']: one for one in one_camera['figures']}
     assert combined['readout_time_s']['mean'] == pytest.approx(0.0301)
     assert combined['readout_time_s']['bags'] == ['a', 'b', 'c']
@@ -137,8 +170,9 @@ def test_calibrations_of_one_camera():
     # 1 mrad to both sides of the mean.
     assert combined['rotation_z_rad']['chi2'] == pytest.approx(2.0, rel=1e-3)
     assert combined['rotation_x_rad']['chi2'] == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(one_camera['quat_cam_imu_xyzw'],
-                               [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9)
+    np.testing.assert_allclose(
+        one_camera['quat_cam_imu_xyzw'], [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9
+    )
 
 
 def results_of(folder: Path) -> dict[str, dict[str, str]]:
@@ -147,7 +181,7 @@ def results_of(folder: Path) -> dict[str, dict[str, str]]:
 
 def damage(bag: Path) -> None:
     file = next(bag.glob('*.mcap'))
-    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
 @pytest.fixture(scope='module')
@@ -174,8 +208,20 @@ def client() -> Iterator[Any]:
 def single(tmp_path_factory, bags) -> Path:
     """What a single replay of the first bag writes."""
     out = tmp_path_factory.mktemp('single')
-    assert main.main(['replay', str(bags / 'first'), '--params', str(bags / 'first.yaml'),
-                      '--out', str(out), '--no-pictures']) == 0
+    assert (
+        main.main(
+            [
+                'replay',
+                str(bags / 'first'),
+                '--params',
+                str(bags / 'first.yaml'),
+                '--out',
+                str(out),
+                '--no-pictures',
+            ]
+        )
+        == 0
+    )
     return out
 
 
@@ -183,9 +229,19 @@ def single(tmp_path_factory, bags) -> Path:
 def replayed(tmp_path_factory, bags) -> Path:
     """The three bags on two processes."""
     out = tmp_path_factory.mktemp('batch')
-    code = main.main(['batch', 'replay', f'{bags}/*', '--out', str(out), '--workers', '2',
-                      '--options=--no-pictures'])
-    assert code == 1   # one is damaged
+    code = main.main(
+        [
+            'batch',
+            'replay',
+            f'{bags}/*',
+            '--out',
+            str(out),
+            '--workers',
+            '2',
+            '--options=--no-pictures',
+        ]
+    )
+    assert code == 1  # one is damaged
     return out
 
 
@@ -201,8 +257,9 @@ def test_results_are_those_of_single_runs(replayed, single):
     assert row['state'] == 'done' and row['message'] == ''
     assert int(row['pairs']) == summary['pairs']['total']
     assert int(row['answered']) == summary['pairs']['answered']
-    assert float(row['rotation_median_deg']) == summary['errors_against_truth'][
-        'rotation_median_deg']
+    assert (
+        float(row['rotation_median_deg']) == summary['errors_against_truth']['rotation_median_deg']
+    )
     assert float(row['seconds']) > 0.5
     # The damaged bag among them.
     assert list(rows) == ['first', 'second', 'third']
@@ -220,14 +277,28 @@ def test_only_what_changed_is_run_again(client, replayed, bags, tmp_path, capsys
     before = {path: path.stat().st_mtime_ns for path in out.glob('*/job.json')}
     damage(bags / 'third')
     try:
-        assert main.main(['batch', 'replay', f'{bags}/*', '--out', str(out), '--scheduler',
-                          client.scheduler.address, '--options=--no-pictures']) == 1
+        assert (
+            main.main(
+                [
+                    'batch',
+                    'replay',
+                    f'{bags}/*',
+                    '--out',
+                    str(out),
+                    '--scheduler',
+                    client.scheduler.address,
+                    '--options=--no-pictures',
+                ]
+            )
+            == 1
+        )
     finally:
         shutil.copytree(bags / 'first', bags / 'third', dirs_exist_ok=True)
     printed = capsys.readouterr().out
     assert '3 bags: 1 done, 2 refused; 2 of them from an earlier run' in printed
-    changed = {path.parent.name for path, stamp in before.items()
-               if path.stat().st_mtime_ns != stamp}
+    changed = {
+        path.parent.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp
+    }
     assert changed == {'third'}
     assert results_of(out)['third']['state'] == 'refused'
     assert not (out / 'third' / 'relative_poses.csv').exists()
@@ -235,8 +306,22 @@ def test_only_what_changed_is_run_again(client, replayed, bags, tmp_path, capsys
 
 def test_check_on_a_running_cluster(client, bags, tmp_path):
     options = ['--out', str(tmp_path), '--scheduler', client.scheduler.address]
-    assert main.main(['batch', 'check', str(bags / 'first'), str(bags / 'absent'), *options,
-                      '--params', str(bags / 'first.yaml'), '--set', 'time_offset=0.03']) == 1
+    assert (
+        main.main(
+            [
+                'batch',
+                'check',
+                str(bags / 'first'),
+                str(bags / 'absent'),
+                *options,
+                '--params',
+                str(bags / 'first.yaml'),
+                '--set',
+                'time_offset=0.03',
+            ]
+        )
+        == 1
+    )
     rows = results_of(tmp_path)
     assert rows['first']['state'] == 'findings' and 'time_offset' in rows['first']['message']
     assert int(rows['first']['failure']) >= 1
@@ -284,31 +369,52 @@ def threads(job: Job) -> tuple[Row, Files]:
     return {**row, 'message': ' '.join(map(str, configured))}, files
 
 
-def jobs(client: Any, folder: Path, *names: str, options: tuple[str, ...] = (),
-         command: str = 'replay', parameters: str | None = None) -> list[Job]:
-    return batch.make_jobs(client, command, [str(folder / name) for name in names], parameters,
-                           options, VERSION)
+def jobs(
+    client: Any,
+    folder: Path,
+    *names: str,
+    options: tuple[str, ...] = (),
+    command: str = 'replay',
+    parameters: str | None = None,
+) -> list[Job]:
+    return batch.make_jobs(
+        client, command, [str(folder / name) for name in names], parameters, options, VERSION
+    )
 
 
 def test_worker_that_dies_in_mid_bag_is_replaced(client, bags, single, tmp_path):
     shutil.copytree(bags / 'first', tmp_path / 'in' / 'mortal')
     shutil.copy(bags / 'first.yaml', tmp_path / 'in' / 'mortal.yaml')
-    rows, _ = run_jobs(client, jobs(client, tmp_path / 'in', 'mortal', options=(str(tmp_path),)),
-                       tmp_path / 'out', die_in_mid_bag)
+    rows, _ = run_jobs(
+        client,
+        jobs(client, tmp_path / 'in', 'mortal', options=(str(tmp_path),)),
+        tmp_path / 'out',
+        die_in_mid_bag,
+    )
     assert (tmp_path / 'mortal.died').exists()
     assert [row['state'] for row in rows] == [DONE]
     assert (tmp_path / 'out' / 'mortal' / 'relative_poses.csv').read_bytes() == (
-        single / 'relative_poses.csv').read_bytes()
+        single / 'relative_poses.csv'
+    ).read_bytes()
 
 
 def test_bag_that_kills_every_worker(client, tmp_path):
     for name in ('a', 'mortal', 'b', 'faulty', 'c'):
         make_bag(tmp_path / name)
-    run_jobs(client, jobs(client, tmp_path, 'a', 'mortal', 'b', 'faulty', 'c'), tmp_path / 'out',
-             die_always)
+    run_jobs(
+        client,
+        jobs(client, tmp_path, 'a', 'mortal', 'b', 'faulty', 'c'),
+        tmp_path / 'out',
+        die_always,
+    )
     rows = results_of(tmp_path / 'out')
     assert [rows[name]['state'] for name in ('a', 'mortal', 'b', 'faulty', 'c')] == [
-        'done', 'lost', 'done', 'failed', 'done']
+        'done',
+        'lost',
+        'done',
+        'failed',
+        'done',
+    ]
     assert 'workers died over this bag' in rows['mortal']['message']
     assert rows['faulty']['message'] == 'ZeroDivisionError: no such number'
 
@@ -329,24 +435,31 @@ def test_summary_of_calibrations(client, tmp_path):
     found, reused = run_jobs(client, calibrations, tmp_path / 'out', work_of_calibrations)
     lines = batch.write_summary(calibrations[0], found, reused, tmp_path / 'out')
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
-    readout = next(one for one in summary['combined']['figures']
-                   if one['figure'] == 'readout_time_s')
+    readout = next(
+        one for one in summary['combined']['figures'] if one['figure'] == 'readout_time_s'
+    )
     assert readout['outliers'] == ['wrong'] and readout['degrees_of_freedom'] == 2
     rows = results_of(tmp_path / 'out')
     assert float(rows['wrong']['readout_time_s']) == 0.024
     assert rows['still5']['readout_time_s_observable'] == 'False'
-    assert any(line.startswith('readout_time_s: 0.03') and line.endswith('outliers: wrong')
-               for line in lines)
+    assert any(
+        line.startswith('readout_time_s: 0.03') and line.endswith('outliers: wrong')
+        for line in lines
+    )
 
 
-@pytest.mark.parametrize('words, configured', [
-    (['replay', 'x', '--workers', '0'], '--workers must be at least 1'),
-    (['replay', 'x', '--params', 'absent.yaml'], 'absent.yaml'),
-    (['replay', 'x', '--set', 'colour=1'], 'colour'),
-    (['calibrate', 'x', '--set', 'seed=1'], 'calibrate takes no parameters'),
-    (['replay', 'x', '--options=--colour'], '--options: --colour are no options of replay'),
-    (['replay', 'x', '--options=--out=y'], '--options must not have --out=y'),
-    (['replay', 'x', '--scheduler', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers')])
+@pytest.mark.parametrize(
+    'words, configured',
+    [
+        (['replay', 'x', '--workers', '0'], '--workers must be at least 1'),
+        (['replay', 'x', '--params', 'absent.yaml'], 'absent.yaml'),
+        (['replay', 'x', '--set', 'colour=1'], 'colour'),
+        (['calibrate', 'x', '--set', 'seed=1'], 'calibrate takes no parameters'),
+        (['replay', 'x', '--options=--colour'], '--options: --colour are no options of replay'),
+        (['replay', 'x', '--options=--out=y'], '--options must not have --out=y'),
+        (['replay', 'x', '--scheduler', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers'),
+    ],
+)
 def test_bad_usage(tmp_path, capsys, monkeypatch, words, configured):
     monkeypatch.setattr('rs_relpose_ros.cli.batch._TIMEOUT', 1.0)
     assert main.main(['batch', *words, '--out', str(tmp_path / 'out')]) == 2

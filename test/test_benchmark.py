@@ -36,35 +36,55 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.tables import POSES
 
-STILL = Cell(speed=0.0, rate=0.0, pixel_noise=1e-2, gravity_noise=1e-3, gyro_noise=1e-3,
-             outliers=0.2)
+STILL = Cell(
+    speed=0.0, rate=0.0, pixel_noise=1e-2, gravity_noise=1e-3, gyro_noise=1e-3, outliers=0.2
+)
 
 
 def test_accuracy_command(tmp_path, capsys, monkeypatch):
     """Two problems with right and double sigmas; a second run uses the kept oracle."""
-    command = ['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-outliers-50',
-               '--noise', 'gaussian', '--sigma-factor', '1', '2', '--output', str(tmp_path)]
+    command = [
+        'benchmark',
+        'accuracy',
+        '--trials',
+        '2',
+        '--cells',
+        'sideways-outliers-50',
+        '--noise',
+        'gaussian',
+        '--sigma-factor',
+        '1',
+        '2',
+        '--output',
+        str(tmp_path),
+    ]
     assert main(command) == 0
     report = (tmp_path / 'accuracy.md').read_text()
     assert report in capsys.readouterr().out
     assert report.count('| sideways-outliers-50 |') == 2
     rows = rows_of(tmp_path / 'trials.csv')
     assert {(row['seed'], row['sigma_factor']) for row in rows} == {
-        (seed, factor) for seed in '01' for factor in ('1.0', '2.0')}
+        (seed, factor) for seed in '01' for factor in ('1.0', '2.0')
+    }
     assert all(float(row['error_rotation']) < 0.5 for row in rows)
     monkeypatch.setattr(accuracy, 'oracle_estimate', lambda *args: pytest.fail('it runs again'))
     assert main(command) == 0
     assert [{**row, 'duration': ''} for row in rows_of(tmp_path / 'trials.csv')] == [
-        {**row, 'duration': ''} for row in rows]
+        {**row, 'duration': ''} for row in rows
+    ]
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['accuracy', '--cells', 'nowhere'], "no cell is named 'nowhere'"),
-    (['speed', '--matches', '10'], '--matches must be at least 50'),
-    (['consistency', '--exposure', '300'], 'exposure_time must be in [0, 0.2] s, got 0.3'),
-    (['trust', '--rows', 'nonsense'], 'no cell is named'),
-    (['trust', '--bags', '0'], 'nothing to measure'),
-    (['live', '--duration', '1'], '--duration must be at least 5')])
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['accuracy', '--cells', 'nowhere'], "no cell is named 'nowhere'"),
+        (['speed', '--matches', '10'], '--matches must be at least 50'),
+        (['consistency', '--exposure', '300'], 'exposure_time must be in [0, 0.2] s, got 0.3'),
+        (['trust', '--rows', 'nonsense'], 'no cell is named'),
+        (['trust', '--bags', '0'], 'nothing to measure'),
+        (['live', '--duration', '1'], '--duration must be at least 5'),
+    ],
+)
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
     assert main(['benchmark', *arguments, '--output', str(tmp_path)]) == 2
     assert message in capsys.readouterr().err
@@ -82,7 +102,7 @@ def test_every_method_answers_in_our_convention(name):
     # A camera at rest in each frame: a global shutter, on which all of them are right. Derotated
     # points make a rotating camera one.
     derotates = name.endswith('_derotated')
-    for cell in (STILL, replace(STILL, rate=3.0))[:1 + derotates]:
+    for cell in (STILL, replace(STILL, rate=3.0))[: 1 + derotates]:
         pair = methods.as_pair(make_problem(cell, 1), cell)
         status, error = methods.run_method(name, pair, 1)
         assert status.value == 'OK'
@@ -109,8 +129,12 @@ def test_speed_and_its_report(tmp_path):
     assert all(timing.matches == 100 and timing.duration > 0.0 for timing in timings)
     report = speed.write_report(tmp_path, timings, timings)
     for found in speed.method_statistics(timings):
-        assert re.search(rf'^\| {found.method} +\| +{found.time.text(2)} .*\| '
-                         rf'+{found.rotation.text(3)} \|', report, re.MULTILINE)
+        assert re.search(
+            rf'^\| {found.method} +\| +{found.time.text(2)} .*\| '
+            rf'+{found.rotation.text(3)} \|',
+            report,
+            re.MULTILINE,
+        )
 
 
 @pytest.mark.parametrize('claimed', [1.0, 0.5])
@@ -121,15 +145,21 @@ def test_nees_of_errors_drawn_from_a_covariance(claimed):
     across = np.eye(3) - np.outer(t, t)
     root = 0.01 * rng.normal(size=(6, 6))
     root[:3] = across @ root[:3]
-    sigma, R_sigma = 0.02, 0.01   # of the truth
+    sigma, R_sigma = 0.02, 0.01  # of the truth
     found = []
     for _ in range(2000):
         error = root @ rng.normal(size=6)
         true_t = t + error[:3] + sigma * across @ rng.normal(size=3)
         pose = RelativePose(Status.OK, R=np.eye(3), t=t, covariance=claimed**2 * root @ root.T)
         turned = Rotation.from_rotvec(error[3:] + R_sigma * rng.normal(size=3)).as_matrix()
-        found.append(pair_errors.pair_consistency('', '', pair_errors.TruePair(
-            0, 1, turned, true_t, claimed * sigma, claimed * R_sigma), pose))
+        found.append(
+            pair_errors.pair_consistency(
+                '',
+                '',
+                pair_errors.TruePair(0, 1, turned, true_t, claimed * sigma, claimed * R_sigma),
+                pose,
+            )
+        )
     assert np.mean([p.rotation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
     assert np.mean([p.translation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
 
@@ -148,30 +178,58 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
     table = tmp_path / 'pairs.csv'
     with table.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
-        writer.writerow(['stamp1_ns', 'stamp2_ns',
-                         *(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3)), 'tx', 'ty', 'tz',
-                         'sigma_t_deg', 'sigma_r_deg'])
+        writer.writerow(
+            [
+                'stamp1_ns',
+                'stamp2_ns',
+                *(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3)),
+                'tx',
+                'ty',
+                'tz',
+                'sigma_t_deg',
+                'sigma_r_deg',
+            ]
+        )
         # The first is of a frame that is not there: asked for, and not answered.
         for start, end in ((stamps[90] - 1, stamps[95]), *reversed(ends)):
             R, t = truth.relative_pose(start + delay_ns, end + delay_ns)
             writer.writerow([start, end, *R.ravel(), *t / np.linalg.norm(t), 1.0, 0.1])
     # The first is that of the largest axis, the second the root of the sum over three.
     assert [pair[4:] for pair in pair_errors.read_true_pairs(table)] == [
-        pytest.approx(np.radians([1.0, 0.1 / np.sqrt(3.0)]))] * 4
-    assert main(['benchmark', 'consistency', '--bags', '0', '--recording', str(bundled_bag),
-                 str(BUNDLED_PARAMETERS), str(table), '--compare', '--output', str(tmp_path)]) == 0
+        pytest.approx(np.radians([1.0, 0.1 / np.sqrt(3.0)]))
+    ] * 4
+    assert (
+        main(
+            [
+                'benchmark',
+                'consistency',
+                '--bags',
+                '0',
+                '--recording',
+                str(bundled_bag),
+                str(BUNDLED_PARAMETERS),
+                str(table),
+                '--compare',
+                '--output',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     report = (tmp_path / 'consistency.md').read_text()
     for method in ('recordings', 'readout ignored', 'MAGSAC'):
         assert re.search(rf'^\| {method} +\| +3 of 4 \|', report, re.MULTILINE)
     assert 'nan' not in report
-    found = grouped([row for row in rows_of(tmp_path / 'consistency.csv') if row['rotation']],
-                    lambda row: row['source'])
+    found = grouped(
+        [row for row in rows_of(tmp_path / 'consistency.csv') if row['rotation']],
+        lambda row: row['source'],
+    )
     for rows in found.values():
         assert {(int(row['stamp1_ns']), int(row['stamp2_ns'])) for row in rows} == set(ends)
     for row in found['recordings']:
         assert float(row['rotation']) < 0.1 and float(row['translation']) < 2.0
         assert float(row['rotation_nees']) < 5.0 and float(row['translation_nees']) < 5.0
-    assert all(not row['rotation_nees'] for row in found['MAGSAC'])   # has no covariance
+    assert all(not row['rotation_nees'] for row in found['MAGSAC'])  # has no covariance
     # The readout of 30 ms, ignored.
     for method in ('readout ignored', 'MAGSAC'):
         assert min(float(row['rotation']) for row in found[method]) > 0.1
@@ -184,8 +242,20 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
 def test_suggested_values_of_wrong_parameters(bundled_bag, tmp_path, monkeypatch):
     """Its file is right: a focal length that the CameraInfo does not have is named."""
     monkeypatch.setattr(suggestions, 'ROWS', {'focal x1.05': suggestions.ROWS['focal x1.05']})
-    assert main(['benchmark', 'suggestions', '--recording', str(bundled_bag),
-                 str(BUNDLED_PARAMETERS), '--output', str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'benchmark',
+                'suggestions',
+                '--recording',
+                str(bundled_bag),
+                str(BUNDLED_PARAMETERS),
+                '--output',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     right, wrong = rows_of(tmp_path / 'suggestions.csv')
     assert right['others'] == '' and right['estimated'] == ''
     assert float(wrong['size']) > 6.0
@@ -199,9 +269,11 @@ def test_differing_poses_are_found(tmp_path):
     row = '{},0.6,0.8,0,0,0,0,1,0.1,0.1,0.1,0.1,0.1,50,{},{},OK'
     first, second = (row.format(ends, 60, 'uniform') for ends in ('1,2', '2,3'))
     live = [row.format('1,2', '', ''), row.format('2,3', '', '')]
-    for rows, found in (((first, second, '3,4' + ',' * 14 + '9,,BAD_INPUT'), (0, 2)),
-                        ((first.replace('0.6,', '0.6000000000000001,'), second), (1, 2)),
-                        (live[:1], (1, 2))):
+    for rows, found in (
+        ((first, second, '3,4' + ',' * 14 + '9,,BAD_INPUT'), (0, 2)),
+        ((first.replace('0.6,', '0.6000000000000001,'), second), (1, 2)),
+        (live[:1], (1, 2)),
+    ):
         paths = []
         for name, lines in (('live.csv', live), ('replay.csv', rows)):
             paths.append(tmp_path / name)
@@ -213,13 +285,24 @@ def test_differing_poses_are_found(tmp_path):
 @pytest.mark.timeout(300)
 def test_demo():
     """The demo itself: three processes over DDS, replays, and the table."""
-    done = subprocess.run([sys.executable, ROOT / 'demo' / 'run_demo.py'], capture_output=True,
-                          text=True, timeout=290)
+    done = subprocess.run(
+        [sys.executable, ROOT / 'demo' / 'run_demo.py'],
+        capture_output=True,
+        text=True,
+        timeout=290,
+    )
     assert done.returncode == 0, done.stderr
-    rows = {name: re.search(rf'^{name}\s+(\d+)\s+(\d+)\s+(\S+)\s+\S+\s+(\S+)', done.stdout, re.M)
-            for name in ('relpose_node, live', 'uniform 9-point', 'uniform 11-point',
-                         '5-point on derotated rays', r'OpenCV 5-point, RANSAC, \S+ px',
-                         r'OpenCV 5-point, USAC_MAGSAC, \S+ px')}
+    rows = {
+        name: re.search(rf'^{name}\s+(\d+)\s+(\d+)\s+(\S+)\s+\S+\s+(\S+)', done.stdout, re.M)
+        for name in (
+            'relpose_node, live',
+            'uniform 9-point',
+            'uniform 11-point',
+            '5-point on derotated rays',
+            r'OpenCV 5-point, RANSAC, \S+ px',
+            r'OpenCV 5-point, USAC_MAGSAC, \S+ px',
+        )
+    }
     assert all(rows.values()), done.stdout
     pairs, poses, rotation, translation = rows['relpose_node, live'].groups()
     assert int(pairs) >= 25 and int(poses) >= 20
@@ -252,9 +335,11 @@ def recording(plan):
 
 
 def test_tracks_are_where_the_renderer_shows_the_points_with_errors_since_the_reference(
-        simulation):
-    known = trust_runs.sightings(simulation, TrackNoise(white=0.2, slip=0.0, wrong=0.0),
-                                 np.random.default_rng(1))
+    simulation,
+):
+    known = trust_runs.sightings(
+        simulation, TrackNoise(white=0.2, slip=0.0, wrong=0.0), np.random.default_rng(1)
+    )
     tracker = trust_runs.SimulatedTracker(known, lambda points: points, 300)
     tracker.start(trust_runs.numbered_image(0, SHAPE))
     for first in (0, 3, 6):
@@ -263,28 +348,34 @@ def test_tracks_are_where_the_renderer_shows_the_points_with_errors_since_the_re
         assert 100 < len(matches) <= 300
         assert np.abs(matches.points2 - matches.points1).max() > 5.0
         true = simulation.true_matches(first, first + 3, matches.points1)
-        shown = np.isfinite(true).all(axis=1)   # a corner's error may move it off its surface
+        shown = np.isfinite(true).all(axis=1)  # a corner's error may move it off its surface
         # Errors from before the reference would enlarge the later ones.
         assert 1.4826 * np.median(np.abs((matches.points2 - true)[shown])) == pytest.approx(
-            0.2, rel=0.2)
+            0.2, rel=0.2
+        )
         tracker.promote()
 
 
 # -- rows --------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize('name', [name for name in ROWS if name != RIGHT])
 def test_a_row_changes_something(name, recording):
     right, sample = recording.configured, recording.samples[40]
     configured = ROWS[name].wrong(right, np.random.default_rng(0))
-    assert (configured.values != right.values or configured.intrinsics != right.intrinsics
-            or configured.sample(sample) != sample
-            or configured.geometry is not trust_rows.AS_IT_IS)
+    assert (
+        configured.values != right.values
+        or configured.intrinsics != right.intrinsics
+        or configured.sample(sample) != sample
+        or configured.geometry is not trust_rows.AS_IT_IS
+    )
 
 
 # -- information: the oracle of what the motion of a recording determines ------------------------
 
-TRUE_CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                              readout_time=0.02)
+TRUE_CAMERA = RollingShutterCamera(
+    width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5, readout_time=0.02
+)
 PAN = (0.0, 0.1, 0.0)
 STEADY, CHANGING = ((0.0, 0.5, 0.0), (0.0, 0.5, 0.0)), ((0.0, 0.2, 0.0), (0.0, 0.8, 0.0))
 
@@ -294,12 +385,17 @@ def information_of(rotvec, rate1=(0.0, 0.0, 0.0), rate2=(0.0, 0.0, 0.0)):
     rng = np.random.default_rng(0)
     R, t = Rotation.from_rotvec(rotvec).as_matrix(), np.array([1.0, 0.0, 0.0])
     points = rng.uniform((-1.5, -1.2, 3.0), (1.5, 1.2, 9.0), (120, 3))
-    pixels = [450.0 * local[:, :2] / local[:, 2:] + (319.5, 239.5)
-              for local in (points, (points - t) @ R)]
+    pixels = [
+        450.0 * local[:, :2] / local[:, 2:] + (319.5, 239.5)
+        for local in (points, (points - t) @ R)
+    ]
     rates = [np.tile(rate, (120, 1)) for rate in (rate1, rate2)]
-    return trust_rows.pair_information(trust_rows.TruePair(
-        *pixels, R, t, 0.2, *rates, np.array(rate1), np.array(rate2), 0.2, 2e-4),
-        TRUE_CAMERA)[0]
+    return trust_rows.pair_information(
+        trust_rows.TruePair(
+            *pixels, R, t, 0.2, *rates, np.array(rate1), np.array(rate2), 0.2, 2e-4
+        ),
+        TRUE_CAMERA,
+    )[0]
 
 
 def sigma_of(quantity, *motion):
@@ -314,17 +410,25 @@ def test_without_rotation_there_is_no_information_on_axes_scale_and_offset():
         assert np.abs(quantities[PLACES[quantity]]).max() < 1e-6 * scale
 
 
-@pytest.mark.parametrize(('quantity', 'axis', 'rates', 'low', 'high'), [
-    # The images alone determine a rotation of 0.1 rad to some 2 mrad: not about its own axis.
-    ('axes', 0, (), 0.0, 0.05), ('axes', 1, (), 1.0, np.inf), ('axes', 2, (), 0.0, 0.05),
-    ('gyro_scale', 0, (), 0.0, 0.05),
-    # An offset shows by a rate that changes: 0.6 rad/s more, to some 2 mrad.
-    ('time_offset', 0, STEADY, 0.05, np.inf), ('time_offset', 0, CHANGING, 1e-3, 1e-2)])
+@pytest.mark.parametrize(
+    ('quantity', 'axis', 'rates', 'low', 'high'),
+    [
+        # The images alone determine a rotation of 0.1 rad to some 2 mrad: not about its own axis.
+        ('axes', 0, (), 0.0, 0.05),
+        ('axes', 1, (), 1.0, np.inf),
+        ('axes', 2, (), 0.0, 0.05),
+        ('gyro_scale', 0, (), 0.0, 0.05),
+        # An offset shows by a rate that changes: 0.6 rad/s more, to some 2 mrad.
+        ('time_offset', 0, STEADY, 0.05, np.inf),
+        ('time_offset', 0, CHANGING, 1e-3, 1e-2),
+    ],
+)
 def test_information_of_a_rotation(quantity, axis, rates, low, high):
     assert low <= sigma_of(quantity, PAN, *rates)[axis] < high
 
 
 # -- results of a bag ----------------------------------------------------------------------------
+
 
 @pytest.mark.recordings
 def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
@@ -343,8 +447,10 @@ def test_a_missing_lens_is_named_although_a_little_more_of_it_would_not_move_the
     """Its poses are off by some degrees; linearised at the estimate, they move by ten sigmas."""
     recording = trust.recording_of(trust.BagPlan(2, 64003, 3.0, 0.0186))
     configured = ROWS['no-distortion'].wrong(recording.configured, np.random.default_rng(0))
-    pairs = [trust_runs.evaluated(recording, *result)
-             for result in trust_runs.run(recording, configured, 1.6)]
+    pairs = [
+        trust_runs.evaluated(recording, *result)
+        for result in trust_runs.run(recording, configured, 1.6)
+    ]
     assert {pair.named for pair in pairs if pair.at > 1.0} == {('distortion',)}
     # Poses are uncertain at first, then suppressed, from the pair after the first certain one on.
     believed = [pair for pair in pairs if pair.has_pose]
@@ -352,8 +458,26 @@ def test_a_missing_lens_is_named_although_a_little_more_of_it_would_not_move_the
 
 
 def test_command_distinguishes_wrong_from_right(tmp_path):
-    assert main(['benchmark', 'trust', '--bags', '1', '--rows', RIGHT, 'imu-cycled', '--seconds',
-                 '6', '--seed', '3', '--output', str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'benchmark',
+                'trust',
+                '--bags',
+                '1',
+                '--rows',
+                RIGHT,
+                'imu-cycled',
+                '--seconds',
+                '6',
+                '--seed',
+                '3',
+                '--output',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     with (tmp_path / 'trust_bags.csv').open(newline='') as file:
         right, cycled = csv.DictReader(file)
     assert int(right['all_poses']) > 15
@@ -366,14 +490,23 @@ def test_command_distinguishes_wrong_from_right(tmp_path):
         assert float(cycled['direction_error']) > 10.0
 
 
-@pytest.mark.parametrize(('row', 'end', 'named'), [
-    ('gyro-degrees', 1.0, {'gyro_unit'}), ('upside-down', 1.0, {'axes', 'image_geometry'}),
-    ('K-1.3', 2.0, {'distortion', 'focal_length', 'image_geometry'})])
+@pytest.mark.parametrize(
+    ('row', 'end', 'named'),
+    [
+        ('gyro-degrees', 1.0, {'gyro_unit'}),
+        ('upside-down', 1.0, {'axes', 'image_geometry'}),
+        ('K-1.3', 2.0, {'distortion', 'focal_length', 'image_geometry'}),
+    ],
+)
 def test_pairs_that_contradict_the_gyro_have_no_pose_but_reveal_the_reason(row, end, named):
     """Of K-1.3 pairs alone reveal it, and none has a pose."""
     recording = trust.recording_of(trust.BagPlan(1, 64005, 3.0, 0.0186))
-    pairs = [pair for pair, _ in trust_runs.run(
-        recording, ROWS[row].wrong(recording.configured, np.random.default_rng(0)), end)]
+    pairs = [
+        pair
+        for pair, _ in trust_runs.run(
+            recording, ROWS[row].wrong(recording.configured, np.random.default_rng(0)), end
+        )
+    ]
     assert sum('contradict' in pair.pose.reason for pair in pairs) >= 4
     assert not any(pair.pose or pair.pose.rotation_known for pair in pairs)
     assert {fault.quantity for fault in pairs[-1].health.faults} & named

@@ -56,16 +56,24 @@ from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCame
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.
-MODELS = {'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
-          'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
-          'equidistant': (0.02, -0.01, 0.003, 0.0)}
+MODELS = {
+    'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
+    'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
+    'equidistant': (0.02, -0.01, 0.003, 0.0),
+}
 
 
 def camera_of(truth: Truth, focal: float | None = None) -> RollingShutterCamera:
     f = truth.focal if focal is None else focal
     return RollingShutterCamera(
-        width=truth.width, height=truth.height, fx=f, fy=f, cx=0.5 * (truth.width - 1),
-        cy=0.5 * (truth.height - 1), readout_time=0.0)
+        width=truth.width,
+        height=truth.height,
+        fx=f,
+        fy=f,
+        cx=0.5 * (truth.width - 1),
+        cy=0.5 * (truth.height - 1),
+        readout_time=0.0,
+    )
 
 
 def simulated(seed: int, movement: object = None, **values: object) -> Recorded:
@@ -99,8 +107,9 @@ def assert_right(result: CalibrationResult, truth: Truth) -> None:
     np.testing.assert_allclose(biases, truth.gyro_bias, atol=5e-3)
 
 
-def written(result: CalibrationResult, camera: RollingShutterCamera,
-            folder: Path) -> tuple[str, Parameters]:
+def written(
+    result: CalibrationResult, camera: RollingShutterCamera, folder: Path
+) -> tuple[str, Parameters]:
     """Text of the parameter file, and what the node reads from it."""
     path = folder / 'calibration.yaml'
     path.write_text(parameter_file(result, 'A test.', camera=camera, compressed=False))
@@ -131,18 +140,23 @@ def test_usual_recording_is_calibrated_from_nothing(tmp_path):
 def test_sigmas_are_of_the_size_of_the_errors():
     recorded, result = usual()
     truth = recorded.truth
-    z = [(result.readout_time.value - truth.readout_time) / result.readout_time.sigma,
-         (result.time_offset.value - truth.time_offset) / result.time_offset.sigma,
-         *((bias.value - true) / bias.sigma
-           for bias, true in zip(result.gyro_bias, truth.gyro_bias, strict=True))]
+    z = [
+        (result.readout_time.value - truth.readout_time) / result.readout_time.sigma,
+        (result.time_offset.value - truth.time_offset) / result.time_offset.sigma,
+        *(
+            (bias.value - true) / bias.sigma
+            for bias, true in zip(result.gyro_bias, truth.gyro_bias, strict=True)
+        ),
+    ]
     assert np.abs(z).max() < 4.5
-    assert np.abs(z).max() > 0.1     # neither claimed ten times too large
+    assert np.abs(z).max() > 0.1  # neither claimed ten times too large
 
 
 def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
     rng = np.random.default_rng(12)
-    truth = dataclasses.replace(drawn(rng, readout_time=0.02, focal=900.0, frames=120),
-                                readout_time=-0.02)
+    truth = dataclasses.replace(
+        drawn(rng, readout_time=0.02, focal=900.0, frames=120), readout_time=-0.02
+    )
     recorded = record(truth, rng)
     guess = 0.8 * truth.width
     camera = camera_of(truth, guess)
@@ -153,22 +167,33 @@ def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
     assert configured.sensor.readout_direction == 'up'
     # As in the node and replay without a CameraInfo.
     intrinsics = configured.intrinsics.of_image(camera.width, camera.height)
-    assert intrinsics.fx == intrinsics.fy == pytest.approx(
-        result.lens.focal_factor.value * guess, abs=0.01)
-    for found, estimate, true in ((intrinsics.distortion[0], result.lens.radial, 0.0),
-                                  (intrinsics.cx, result.lens.column, camera.cx),
-                                  (intrinsics.cy, result.lens.row, camera.cy)):
+    assert (
+        intrinsics.fx
+        == intrinsics.fy
+        == pytest.approx(result.lens.focal_factor.value * guess, abs=0.01)
+    )
+    for found, estimate, true in (
+        (intrinsics.distortion[0], result.lens.radial, 0.0),
+        (intrinsics.cx, result.lens.column, camera.cx),
+        (intrinsics.cy, result.lens.row, camera.cy),
+    ):
         assert found == pytest.approx(estimate.value, abs=0.01)
         assert abs(found - true) < 4.0 * estimate.sigma
     # Left out, and named, if it is not determined.
-    unknown = dataclasses.replace(result, lens=result.lens._replace(focal_factor=Estimate(
-        1.0, 1.0, observable=False, determined=False, remark='too slow')))
+    unknown = dataclasses.replace(
+        result,
+        lens=result.lens._replace(
+            focal_factor=Estimate(1.0, 1.0, observable=False, determined=False, remark='too slow')
+        ),
+    )
     text, _ = written(unknown, camera, tmp_path)
     assert 'camera_matrix (too slow)' in text and 'camera_matrix:' not in text
 
 
-@pytest.mark.parametrize(('model', 'coefficients'), [
-    ('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)), ('equidistant', (0.03, 0.0, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    ('model', 'coefficients'),
+    [('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)), ('equidistant', (0.03, 0.0, 0.0, 0.0))],
+)
 def test_lens_is_estimated(model, coefficients, tmp_path):
     """All rows of a global shutter have one time: its pixels may be distorted afterwards.
 
@@ -176,12 +201,21 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
     """
     recorded = simulated(21, readout_time=0.0, fps=30.0)
     pinhole = camera_of(recorded.truth)
-    lens = dataclasses.replace(pinhole, distortion_model=model, distortion=coefficients,
-                               cx=pinhole.cx + 10.0, cy=pinhole.cy - 10.0)
-    bent = dataclasses.replace(recorded.tracks, points=lens.project(
-        pinhole.unproject(recorded.tracks.points)))
-    guess = dataclasses.replace(camera_of(recorded.truth, 0.8 * recorded.truth.width),
-                                distortion_model=model, distortion=(0.0,) * len(coefficients))
+    lens = dataclasses.replace(
+        pinhole,
+        distortion_model=model,
+        distortion=coefficients,
+        cx=pinhole.cx + 10.0,
+        cy=pinhole.cy - 10.0,
+    )
+    bent = dataclasses.replace(
+        recorded.tracks, points=lens.project(pinhole.unproject(recorded.tracks.points))
+    )
+    guess = dataclasses.replace(
+        camera_of(recorded.truth, 0.8 * recorded.truth.width),
+        distortion_model=model,
+        distortion=(0.0,) * len(coefficients),
+    )
     result = calibrate(bent, recorded.gyro, guess, focal_known=False)
     assert_right(result, recorded.truth)
     assert result.shutter == 'global'
@@ -212,26 +246,32 @@ def test_a_transform_gives_the_rotation_that_the_motion_does_not():
     """Of a robot on wheels; one that contradicts the images is not used."""
     recorded = one_axis()
     true = Rotation.from_matrix(recorded.truth.R_cam_imu)
-    result = calibrated(recorded, quat_prior=(
-        Rotation.from_rotvec([0.03, -0.04, 0.02]) * true).as_quat())
+    result = calibrated(
+        recorded, quat_prior=(Rotation.from_rotvec([0.03, -0.04, 0.02]) * true).as_quat()
+    )
     assert result.complete and result.rotation.determined
     apart = (Rotation.from_matrix(result.R_cam_imu) * true.inv()).as_rotvec()
     assert (np.abs(apart) < 3.0 * result.rotation_sigma).all()
     assert 0.04 < result.rotation_sigma.max() < 0.09
-    other = calibrated(recorded, quat_prior=(
-        Rotation.from_rotvec([0.0, 0.0, 1.5]) * true).as_quat())
+    other = calibrated(
+        recorded, quat_prior=(Rotation.from_rotvec([0.0, 0.0, 1.5]) * true).as_quat()
+    )
     assert not other.rotation.determined
     recorded, usual_result = usual()
-    same = calibrated(recorded, quat_prior=(
-        Rotation.from_rotvec([0.0, 0.5, 0.0]) * Rotation.from_matrix(
-            recorded.truth.R_cam_imu)).as_quat())
+    same = calibrated(
+        recorded,
+        quat_prior=(
+            Rotation.from_rotvec([0.0, 0.5, 0.0]) * Rotation.from_matrix(recorded.truth.R_cam_imu)
+        ).as_quat(),
+    )
     np.testing.assert_array_equal(same.R_cam_imu, usual_result.R_cam_imu)
 
 
 def few_frames(tracks: Tracks, count: int) -> Tracks:
     kept = tracks.frames < count
-    return Tracks(tracks.stamps_ns[:count], tracks.frames[kept], tracks.ids[kept],
-                  tracks.points[kept])
+    return Tracks(
+        tracks.stamps_ns[:count], tracks.frames[kept], tracks.ids[kept], tracks.points[kept]
+    )
 
 
 def few_points(tracks: Tracks) -> Tracks:
@@ -241,14 +281,22 @@ def few_points(tracks: Tracks) -> Tracks:
 
 UNUSABLE = {
     'too short: 10 frames': lambda tracks, gyro: (few_frames(tracks, 10), gyro),
-    'hardly rotates': lambda tracks, gyro: (tracks, GyroSeries(
-        gyro.stamps_ns, 0.05 + 1e-3 * np.random.default_rng(0).standard_normal(
-            gyro.rates.shape))),
+    'hardly rotates': lambda tracks, gyro: (
+        tracks,
+        GyroSeries(
+            gyro.stamps_ns,
+            0.05 + 1e-3 * np.random.default_rng(0).standard_normal(gyro.rates.shape),
+        ),
+    ),
     'too few points': lambda tracks, gyro: (few_points(tracks), gyro),
     'short exposure': lambda tracks, gyro: (
-        dataclasses.replace(tracks, ids=np.arange(len(tracks.ids))), gyro),
-    'the gyro covers 0.0 s': lambda tracks, gyro: (tracks, GyroSeries(
-        gyro.stamps_ns + 3600 * NANOSECONDS, gyro.rates)),
+        dataclasses.replace(tracks, ids=np.arange(len(tracks.ids))),
+        gyro,
+    ),
+    'the gyro covers 0.0 s': lambda tracks, gyro: (
+        tracks,
+        GyroSeries(gyro.stamps_ns + 3600 * NANOSECONDS, gyro.rates),
+    ),
 }
 
 
@@ -262,13 +310,15 @@ def test_unusable_recordings_are_refused(message):
 def test_readout_longer_than_the_interval_is_refused():
     rng = np.random.default_rng(16)
     # No camera can do this: the simulation can.
-    truth = dataclasses.replace(drawn(rng, readout_time=0.03, fps=30.0, frames=70),
-                                readout_time=0.045)
+    truth = dataclasses.replace(
+        drawn(rng, readout_time=0.03, fps=30.0, frames=70), readout_time=0.045
+    )
     with pytest.raises(InputError, match='longer than the interval'):
         calibrated(record(truth, rng))
 
 
 # -- parts ------------------------------------------------------------------------------------
+
 
 def test_every_axis_map_is_recognised():
     maps = observations.axis_maps()
@@ -279,10 +329,11 @@ def test_every_axis_map_is_recognised():
         np.testing.assert_array_equal(observations.nearest_axis_map(tilt @ matrix), matrix)
 
 
-@pytest.mark.parametrize('rotation, axes', [
-    ([0.5, -1.2, 2.0], np.ones(3)),
-    ([math.radians(30.0), 0.0, 0.0], np.array([0.0, 1.0, 0.0]))],
-    ids=['three axes', 'of one axis the rotation nearest to an axis map'])
+@pytest.mark.parametrize(
+    'rotation, axes',
+    [([0.5, -1.2, 2.0], np.ones(3)), ([math.radians(30.0), 0.0, 0.0], np.array([0.0, 1.0, 0.0]))],
+    ids=['three axes', 'of one axis the rotation nearest to an axis map'],
+)
 def test_search_finds_offset_and_rotation(rotation, axes):
     """Of a gyro 50 ms ahead."""
     R, rng = Rotation.from_rotvec(rotation).as_matrix(), np.random.default_rng(3)
@@ -290,10 +341,12 @@ def test_search_finds_offset_and_rotation(rotation, axes):
     rates = axes * np.sin(2.0 * times[:, None] * [1.0, 1.7, 2.3]) * 0.4
     begins = np.linspace(0.5, 5.0, 120)
     ends = begins + 0.033
-    estimated = np.stack([np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i])
-                          for i in range(3)], axis=1) @ R.T + 0.01 * rng.standard_normal((120, 3))
-    found, *_ = observations.find_starts(estimated, begins, ends, times, rates, max_offset=0.2,
-                                         focal_factors=np.ones(1))
+    estimated = np.stack(
+        [np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i]) for i in range(3)], axis=1
+    ) @ R.T + 0.01 * rng.standard_normal((120, 3))
+    found, *_ = observations.find_starts(
+        estimated, begins, ends, times, rates, max_offset=0.2, focal_factors=np.ones(1)
+    )
     assert found.offset == pytest.approx(0.05, abs=5e-3)
     assert found.misfit < 0.02
     np.testing.assert_allclose(found.R_cam_imu, R, atol=0.03)
@@ -311,8 +364,13 @@ def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
     problem = problem._replace(covariates=0.01 * np.outer([1.0, 2.0], np.arange(len(pairs))))
     middle_row = 0.5 * (truth.height - 1) / truth.height
     unknowns = initial(
-        problem, truth.R_cam_imu.T, truth.time_offset + middle_row * truth.readout_time + 1e-3,
-        truth.readout_time + 2e-3, np.array(truth.gyro_bias), noise=1.0)
+        problem,
+        truth.R_cam_imu.T,
+        truth.time_offset + middle_row * truth.readout_time + 1e-3,
+        truth.readout_time + 2e-3,
+        np.array(truth.gyro_bias),
+        noise=1.0,
+    )
     unknowns.parameters[coplanarity.LENS] = 0.01, 0.02, 1.0, -2.0
     return problem, unknowns, truth
 
@@ -332,8 +390,9 @@ def test_gradient_is_that_of_finite_differences():
     h = 1e-6
     numeric = np.array([(cost(h * unit) - cost(-h * unit)) / (2 * h) for unit in np.eye(GLOBAL)])
     exact = np.arange(GLOBAL) != EXPOSURE
-    np.testing.assert_allclose(analytic[exact], numeric[exact], rtol=2e-3,
-                               atol=1e-4 * np.abs(numeric).max())
+    np.testing.assert_allclose(
+        analytic[exact], numeric[exact], rtol=2e-3, atol=1e-4 * np.abs(numeric).max()
+    )
     # The rotation that an exposure makes is of first order in the turn within it.
     assert analytic[EXPOSURE] == pytest.approx(numeric[EXPOSURE], rel=0.03)
 
@@ -341,7 +400,7 @@ def test_gradient_is_that_of_finite_differences():
 def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
     problem, unknowns, truth = few_pairs()
     unknowns = unknowns._replace(parameters=unknowns.parameters.copy())
-    unknowns.parameters[coplanarity.LENS] = 0.0     # the points are moved in front of it
+    unknowns.parameters[coplanarity.LENS] = 0.0  # the points are moved in front of it
     residuals = evaluate(problem, unknowns, derivatives=False).residuals
     # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
     h, n = 1e-4, 17
@@ -374,8 +433,9 @@ def test_rays_are_the_same_through_every_camera_model(model):
     def problem(points: np.ndarray, camera: RollingShutterCamera) -> coplanarity.Problem:
         estimated = dataclasses.replace(tracks, points=points)
         data = Observations.of(estimated, recorded.gyro, camera)
-        pairs = make_pairs(data.tracks, (1,), PairSelection((), 500, 1, 99), 1.0,
-                           np.random.default_rng(0))
+        pairs = make_pairs(
+            data.tracks, (1,), PairSelection((), 500, 1, 99), 1.0, np.random.default_rng(0)
+        )
         return data.problem(pairs, 0.0)
 
     straight = problem(tracks.points, pinhole).points
@@ -389,9 +449,10 @@ def test_rays_are_the_same_through_every_camera_model(model):
 
 
 def test_pairs_have_the_tracks_points_in_common():
-    tracks = Tracks(*map(np.array, ([0, 10, 20, 30], [0, 0, 1, 1, 1, 3, 3],
-                                    [5, 6, 6, 5, 7, 7, 6])),
-                    np.arange(14.0).reshape(7, 2))
+    tracks = Tracks(
+        *map(np.array, ([0, 10, 20, 30], [0, 0, 1, 1, 1, 3, 3], [5, 6, 6, 5, 7, 7, 6])),
+        np.arange(14.0).reshape(7, 2),
+    )
     pairs = make_pairs(tracks, (1, 2), PairSelection((), 9, 1, 99), 1.0, np.random.default_rng(0))
     assert [pair[:2] for pair in pairs] == [(0, 1), (1, 3)]
     np.testing.assert_array_equal(pairs[0].rows, [[0, 1], [3, 2]])
@@ -407,6 +468,7 @@ def stamps_of(intervals_ms: list[float]) -> np.ndarray:
 
 
 # -- why intervals vary ------------------------------------------------------------------------
+
 
 def test_exposure_keeps_its_intervals_and_jitter_does_not():
     rng = np.random.default_rng(1)
@@ -439,12 +501,18 @@ def test_a_lost_frame_is_no_exposure():
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize(('name', 'column', 'varying'), [
-    ('realsense_rgb_rs', 2, Varying.EXPOSURE), ('realsense_rgb_rs_b', 2, Varying.EXPOSURE),
-    ('android_phone_rs', 1, Varying.JITTER)])
+@pytest.mark.parametrize(
+    ('name', 'column', 'varying'),
+    [
+        ('realsense_rgb_rs', 2, Varying.EXPOSURE),
+        ('realsense_rgb_rs_b', 2, Varying.EXPOSURE),
+        ('android_phone_rs', 1, Varying.JITTER),
+    ],
+)
 def test_jitter_and_exposure_of_real_stamps(recordings, name, column, varying):
-    stamps = np.loadtxt(recordings / name / 'frames.csv', delimiter=',', skiprows=1,
-                        usecols=column, dtype=np.int64)
+    stamps = np.loadtxt(
+        recordings / name / 'frames.csv', delimiter=',', skiprows=1, usecols=column, dtype=np.int64
+    )
     assert frame_times(stamps).varying is varying
 
 
@@ -463,7 +531,8 @@ def test_exposure_becomes_two_parameters_of_the_node(tmp_path):
         intervals = np.concatenate([np.full(80, 1.0 / 30.0), np.full(79, 1.2 / 30.0)])
         true = recorded.truth.time_offset - 0.5 * (interval - np.median(intervals))
         offset = sensor.time_offset + sensor.time_offset_per_interval * (
-            interval - sensor.time_offset_reference_interval)
+            interval - sensor.time_offset_reference_interval
+        )
         assert offset == pytest.approx(true, abs=1.5e-3)
 
 
@@ -483,6 +552,7 @@ def test_jitter_of_stamps_is_not_taken_for_exposure(tmp_path):
 
 # -- sigmas: regions of the image, both halves, lens and gyro, exposure -----------------------
 
+
 @lru_cache(maxsize=1)
 def recorded() -> Recorded:
     return simulated(31, frames=100, fps=30.0, gyro_rate=200.0)
@@ -500,11 +570,18 @@ def fitted(free: np.ndarray, **changes: object) -> tuple[Fit, observations.Obser
     truth = source.truth
     data = observations.Observations.of(source.tracks, source.gyro, camera_of(truth))
     offset = truth.time_offset + 0.5 * truth.readout_time
-    pairs = data.pairs(observations.PairSelection((0.033, 0.1), 60, 20, 999),
-                       np.random.default_rng(0))
+    pairs = data.pairs(
+        observations.PairSelection((0.033, 0.1), 60, 20, 999), np.random.default_rng(0)
+    )
     problem = data.problem(pairs, offset)
-    begin = fitting.initial(problem, truth.R_cam_imu.T, offset, truth.readout_time,
-                            np.array(truth.gyro_bias), noise=1.0)
+    begin = fitting.initial(
+        problem,
+        truth.R_cam_imu.T,
+        offset,
+        truth.readout_time,
+        np.array(truth.gyro_bias),
+        noise=1.0,
+    )
     return fitting.fit(fitting.with_bends(problem, begin), begin, free, rounds=15), data
 
 
@@ -515,8 +592,9 @@ def undisturbed() -> tuple[Fit, observations.Observations]:
 
 def wider(final: Fit, errors: ModelErrors | None = None) -> np.ndarray:
     """Sigmas after `widened` over those before."""
-    before, after = (np.diag(some.covariance)[final.free]
-                     for some in (final, widened(final, errors)))
+    before, after = (
+        np.diag(some.covariance)[final.free] for some in (final, widened(final, errors))
+    )
     return np.sqrt(after / before)
 
 
@@ -567,7 +645,7 @@ def test_errors_of_lens_and_gyro_are_added():
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
     # A gyro whose rates are 0.5 % larger has a bias that is 0.5 % larger, at least.
     bias = np.abs(recorded().truth.gyro_bias)
-    assert (np.sqrt(np.diag(difference)[BIAS:BIAS + 3]) > 0.3 * errors.gyro_scale * bias).all()
+    assert (np.sqrt(np.diag(difference)[BIAS : BIAS + 3]) > 0.3 * errors.gyro_scale * bias).all()
     none = widened(final, ModelErrors(*[0.0] * len(errors)))
     np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-9)
 
@@ -575,10 +653,11 @@ def test_errors_of_lens_and_gyro_are_added():
 def test_effect_of_an_exposure_on_a_quadratic_rate():
     """Its mean over an exposure h exceeds it by ``h^2 / 24 w''``, whatever h is assumed."""
     stamps = np.arange(0, 2_000_000_000, 2_000_000)
-    rates = np.repeat((1e-9 * stamps[:, None])**2, 3, axis=1)
+    rates = np.repeat((1e-9 * stamps[:, None]) ** 2, 3, axis=1)
     for exposure in (0.0, 0.04):
-        mean, by_square = observations.exposed_rates(GyroSeries(stamps, rates),
-                                                     np.full(len(stamps), exposure))
+        mean, by_square = observations.exposed_rates(
+            GyroSeries(stamps, rates), np.full(len(stamps), exposure)
+        )
         np.testing.assert_allclose((mean - rates)[30:-30], exposure**2 / 12.0, atol=1e-6)
         np.testing.assert_allclose(by_square[30:-30], 2.0 / 24.0, rtol=0.03)
 
@@ -601,15 +680,20 @@ def test_exposure_is_found():
 @pytest.mark.parametrize('given', [{}, {'exposure_time': 0.03}], ids=['unknown', 'given'])
 def test_exposure_is_taken_in_by_the_readout_and_written(given, tmp_path):
     source = recorded()
-    result = calibrate(source.tracks, sharper(0.03**2), camera_of(source.truth),
-                       config=dataclasses.replace(TRACKED_IN_IMAGES, **given))
+    result = calibrate(
+        source.tracks,
+        sharper(0.03**2),
+        camera_of(source.truth),
+        config=dataclasses.replace(TRACKED_IN_IMAGES, **given),
+    )
     readout, exposure = result.readout_time, result.exposure
     assert abs(readout.value - source.truth.readout_time) < 3.0 * readout.sigma < 3e-3
     assert abs(exposure.value - 0.03) <= 3.0 * exposure.sigma
     assert (exposure.sigma == 0.0) == bool(given)
     path = tmp_path / 'calibration.yaml'
-    path.write_text(parameter_file(result, 'A test.', camera=camera_of(source.truth),
-                                   compressed=False))
+    path.write_text(
+        parameter_file(result, 'A test.', camera=camera_of(source.truth), compressed=False)
+    )
     sensor = read_parameters(path).sensor
     assert sensor.exposure_time == pytest.approx(exposure.value, abs=1e-5)
     assert sensor.readout_time_sigma == pytest.approx(readout.sigma, abs=1e-6)
@@ -622,8 +706,9 @@ def test_automatic_exposure_is_the_interval_less_a_margin():
     exposure = observations.Exposure.of(times, stamps, TRACKED_IN_IMAGES)
     np.testing.assert_allclose(exposure.assumed[1:], intervals[1:] - exposure.margin, atol=1e-8)
     assert 0.005 < exposure.margin < 0.012 and exposure.square_sigma > 0.0
-    known = observations.Exposure.of(times, stamps, dataclasses.replace(
-        TRACKED_IN_IMAGES, exposure_margin=0.01))
+    known = observations.Exposure.of(
+        times, stamps, dataclasses.replace(TRACKED_IN_IMAGES, exposure_margin=0.01)
+    )
     np.testing.assert_allclose(known.assumed[1:], intervals[1:] - 0.01, atol=1e-8)
     assert known.square_sigma == 0.0
 
@@ -639,8 +724,12 @@ def evaluated_at(readout: float, sigma: float) -> tuple[CalibrationResult, Fit]:
     covariance[READOUT, ROTATION] = covariance[ROTATION, READOUT] = 0.1 * sigma**2
     covariance[OFFSET, OFFSET] += 0.25 * sigma**2
     covariance[ROTATION, ROTATION] += 0.01 * sigma**2
-    final = dataclasses.replace(final, unknowns=final.unknowns._replace(parameters=parameters),
-                                covariance=covariance, converged=True)
+    final = dataclasses.replace(
+        final,
+        unknowns=final.unknowns._replace(parameters=parameters),
+        covariance=covariance,
+        converged=True,
+    )
     curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     return evaluated(data, final, curve, CalibrationConfig()), final
 
@@ -654,7 +743,8 @@ def test_a_readout_that_the_images_do_not_determine_is_that_of_the_interval():
     known = interval / math.sqrt(12.0)
     weight = 0.05**-2 + known**-2
     assert readout.value == pytest.approx(
-        (-0.004 * 0.05**-2 + 0.5 * interval * known**-2) / weight, rel=1e-6)
+        (-0.004 * 0.05**-2 + 0.5 * interval * known**-2) / weight, rel=1e-6
+    )
     assert readout.sigma == pytest.approx(weight**-0.5, rel=1e-6)
     # What is correlated with it follows, with a sigma of its own part only.
     assert result.time_offset.sigma > 0.4 * known
@@ -664,7 +754,7 @@ def test_a_readout_that_the_images_do_not_determine_is_that_of_the_interval():
 def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     final, data = fitted(free_of(EXPOSURE) | np.isin(np.arange(GLOBAL), np.arange(GLOBAL)[LENS]))
     covariance, sigma = final.covariance.copy(), 0.015 * data.camera.width
-    covariance[CENTER, CENTER] += (10.0 * sigma)**2
+    covariance[CENTER, CENTER] += (10.0 * sigma) ** 2
     wide = dataclasses.replace(final, covariance=covariance)
     curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     result = evaluated(data, wide, curve, CalibrationConfig())
@@ -682,7 +772,8 @@ def test_the_interval_between_frames_bounds_the_readout(sign):
     interval, sigma = undisturbed()[1].interval, 1e-3
     result, final = evaluated_at(sign * (interval + 5e-4), sigma)
     drawn_at = final.unknowns.parameters[READOUT] + sigma * np.random.default_rng(
-        5).standard_normal(1_000_000)
+        5
+    ).standard_normal(1_000_000)
     mean = float(drawn_at[np.abs(drawn_at) <= interval].mean())
     readout, moved = result.readout_time, mean - final.unknowns.parameters[READOUT]
     assert readout.observable and abs(readout.value) < interval
@@ -713,6 +804,7 @@ def test_a_readout_for_certain_beyond_the_interval_is_refused():
 
 # -- parts of a recording ----------------------------------------------------------------------
 
+
 def test_stretches_of_a_simulated_camera_agree(tmp_path):
     source = recorded()
     recording = CalibrationInput(source.tracks, source.gyro, camera_of(source.truth), True, {})
@@ -734,7 +826,8 @@ def mean_of(samples: np.ndarray, groups: np.ndarray) -> tuple[float, float]:
     """Mean and its sigma: the score of sample x is mean - x, its curvature 1."""
     mean = float(samples.mean())
     covariance = fitting.jackknife(
-        (mean - samples)[:, None], np.ones((len(samples), 1, 1)), groups, np.zeros(1))
+        (mean - samples)[:, None], np.ones((len(samples), 1, 1)), groups, np.zeros(1)
+    )
     return mean, math.sqrt(covariance[0, 0])
 
 
@@ -758,8 +851,9 @@ def test_jackknife_covers_errors_that_a_group_has_in_common():
 
 
 def test_prior_counts_as_known():
-    covariance = fitting.jackknife(np.zeros((10, 1)), np.zeros((10, 1, 1)), np.arange(10),
-                                   np.array([4.0]))
+    covariance = fitting.jackknife(
+        np.zeros((10, 1)), np.zeros((10, 1, 1)), np.arange(10), np.array([4.0])
+    )
     assert covariance[0, 0] == pytest.approx(0.25)
 
 

@@ -24,8 +24,16 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 SMALL = SimulationConfig(
-    duration=3.0, width=320, height=240, fx=225.0, edge_samples=1, plan='walk:3',
-    readout_time=0.02, time_offset=0.03, seed=5)
+    duration=3.0,
+    width=320,
+    height=240,
+    fx=225.0,
+    edge_samples=1,
+    plan='walk:3',
+    readout_time=0.02,
+    time_offset=0.03,
+    seed=5,
+)
 
 
 @pytest.fixture(scope='module')
@@ -57,6 +65,7 @@ def test_bag_gives_a_parameter_file_that_the_node_takes(bag, tmp_path, capsys):
 def test_the_chosen_tracker_is_used(bag, tmp_path, monkeypatch, refused):
     def refuse(config: TrackingConfig) -> None:
         raise InputError(f'a tracker of {config.detector}')
+
     monkeypatch.setattr(procedure, 'make_tracker', refuse)
     refused('a tracker of sift', 'calibrate', bag, '--out', tmp_path, '--detector', 'sift')
 
@@ -80,24 +89,41 @@ def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
     assert values['focal_px']['value'] == pytest.approx(225.0, rel=0.02)
     poses, errors = [], []
     for parameters in (out / 'calibration.yaml', tmp_path / 'without.yaml'):
-        if not parameters.exists():   # the same with the lens of the CameraInfo
+        if not parameters.exists():  # the same with the lens of the CameraInfo
             document = yaml.safe_load((out / 'calibration.yaml').read_text())
             given = document['/**']['ros__parameters']
             for name in ('camera_matrix', 'distortion_model', 'distortion_coefficients'):
                 del given[name]
             parameters.write_text(yaml.safe_dump(document))
-        assert main(['replay', str(path), '--params', str(parameters), '--no-pictures',
-                     '--out', str(tmp_path / parameters.stem)]) in (0, 1)
+        assert main(
+            [
+                'replay',
+                str(path),
+                '--params',
+                str(parameters),
+                '--no-pictures',
+                '--out',
+                str(tmp_path / parameters.stem),
+            ]
+        ) in (0, 1)
         rows = rows_of(tmp_path / parameters.stem / 'relative_poses.csv')
         poses.append(sum(row['tx'] != '' for row in rows) / len(rows))
-        errors.append(np.median([float(row['translation_error_deg']) for row in rows_of(
-            tmp_path / parameters.stem / 'errors.csv') if row['translation_error_deg']]))
+        errors.append(
+            np.median(
+                [
+                    float(row['translation_error_deg'])
+                    for row in rows_of(tmp_path / parameters.stem / 'errors.csv')
+                    if row['translation_error_deg']
+                ]
+            )
+        )
     assert poses[0] >= 0.9
     assert errors[0] < 0.5 * errors[1]
 
 
-@pytest.mark.parametrize(('change', 'reason'), [
-    (lambda message: None, 'distortion coefficients'), (binned, 'binning')])
+@pytest.mark.parametrize(
+    ('change', 'reason'), [(lambda message: None, 'distortion coefficients'), (binned, 'binning')]
+)
 def test_lens_that_is_not_estimated(bag, change, reason, tmp_path, capsys):
     path = copied(bag, tmp_path / 'bag', change)
     assert main(['calibrate', str(path), '--lens', '--out', str(tmp_path / 'out')]) == 2
@@ -114,33 +140,52 @@ def no_gyro(message: Any) -> None:
         message.angular_velocity_covariance = np.array([-1.0] + 8 * [0.0])
 
 
-@pytest.mark.parametrize(('change', 'record_instead'), [
-    (blank, 'texture'), (no_gyro, 'angular velocity'),
-    (lambda message: hasattr(message, 'angular_velocity'), 'Imu')],
-    ids=['no texture', 'no gyro', 'no IMU'])
+@pytest.mark.parametrize(
+    ('change', 'record_instead'),
+    [
+        (blank, 'texture'),
+        (no_gyro, 'angular velocity'),
+        (lambda message: hasattr(message, 'angular_velocity'), 'Imu'),
+    ],
+    ids=['no texture', 'no gyro', 'no IMU'],
+)
 def test_bags_that_are_refused(bag, change, record_instead, tmp_path, refused):
     unusable = copied(bag, tmp_path / 'bag', change)
     refused(record_instead, 'calibrate', unusable, '--out', tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
 
 
-@pytest.mark.parametrize('option, values, text', [
-    ('--rows', ['500', '900'], '--rows 500 900 leave nothing of an image of 240 rows'),
-    ('--max-offset', ['-1'], '--max-offset must be'), ('--rows', ['-5', '100'], '--rows must be'),
-    ('--rows', ['100', '50'], '--rows must be')])
+@pytest.mark.parametrize(
+    'option, values, text',
+    [
+        ('--rows', ['500', '900'], '--rows 500 900 leave nothing of an image of 240 rows'),
+        ('--max-offset', ['-1'], '--max-offset must be'),
+        ('--rows', ['-5', '100'], '--rows must be'),
+        ('--rows', ['100', '50'], '--rows must be'),
+    ],
+)
 def test_illegal_values_are_named_by_their_option(bag, option, values, text, tmp_path, refused):
     refused(f'error: {text}', 'calibrate', bag, option, *values, '--out', tmp_path)
 
 
 EUROC = RollingShutterCamera(
-    width=752, height=480, fx=458.654, fy=457.296, cx=367.215, cy=248.375,
+    width=752,
+    height=480,
+    fx=458.654,
+    fy=457.296,
+    cx=367.215,
+    cy=248.375,
     distortion_model='plumb_bob',
-    distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0), readout_time=0.0)
+    distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
+    readout_time=0.0,
+)
 
 
 def gyro_of(path: Path) -> GyroSeries:
-    return GyroSeries(np.loadtxt(path, delimiter=',', usecols=0, dtype=np.int64),
-                      np.loadtxt(path, delimiter=',', usecols=(1, 2, 3)))
+    return GyroSeries(
+        np.loadtxt(path, delimiter=',', usecols=0, dtype=np.int64),
+        np.loadtxt(path, delimiter=',', usecols=(1, 2, 3)),
+    )
 
 
 def corners_of(path: Path, frames: slice) -> Tracks:
@@ -148,9 +193,12 @@ def corners_of(path: Path, frames: slice) -> Tracks:
         names = sorted(name for name in archive.getnames() if name.endswith('.csv'))[frames]
         lines = [archive.extractfile(name).read().decode().split()[1:] for name in names]
     values = np.loadtxt([line for of_frame in lines for line in of_frame], delimiter=',')
-    return Tracks(np.array([int(Path(name).stem) for name in names]),
-                  np.repeat(np.arange(len(names)), [len(of_frame) for of_frame in lines]),
-                  (4 * values[:, 10] + values[:, 11]).astype(np.int64), values[:, 5:7])
+    return Tracks(
+        np.array([int(Path(name).stem) for name in names]),
+        np.repeat(np.arange(len(names)), [len(of_frame) for of_frame in lines]),
+        (4 * values[:, 10] + values[:, 11]).astype(np.int64),
+        values[:, 5:7],
+    )
 
 
 @pytest.mark.recordings
@@ -193,7 +241,7 @@ def test_slow_hand(converted, tmp_path):
     readout = values['readout_time_s']
     assert not readout['observable']
     assert abs(readout['value'] - 0.0315) < 2.0 * readout['sigma'] < 15e-3
-    assert values['shutter'] != 'global'   # about 5 sigma from zero: rolling from there on
+    assert values['shutter'] != 'global'  # about 5 sigma from zero: rolling from there on
     assert values['time_offset_s']['value'] == pytest.approx(-0.058, abs=5e-3)
     assert values['offset_by_interval']['value'] < 0.0
     assert np.allclose(values['axis_map'], np.eye(3))

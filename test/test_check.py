@@ -29,18 +29,28 @@ from rs_relpose_ros.tracking.images import Pixels
 
 START, TYPES = 1_700_000_000_000_000_000, build.rosbags_types
 MS = 1_000_000
-CAMERA = RollingShutterCamera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5,
-                              readout_time=0.02, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
+CAMERA = RollingShutterCamera(
+    width=160,
+    height=120,
+    fx=150.0,
+    fy=150.0,
+    cx=79.5,
+    cy=59.5,
+    readout_time=0.02,
+    distortion=(-0.1, 0.0, 0.0, 0.0, 0.0),
+)
 GIVEN = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}
-PIXELS = cv2.resize(np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np.uint8),
-                    (160, 120))
+PIXELS = cv2.resize(
+    np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np.uint8), (160, 120)
+)
 
 
 def checked(path, parameters=None, **topics):
     """Findings by name, and the report."""
     with open_bag(path) as bag:
-        report = check_bag(bag, bag.choose_topics(topics),
-                           parameters or Parameters.from_mapping(GIVEN))
+        report = check_bag(
+            bag, bag.choose_topics(topics), parameters or Parameters.from_mapping(GIVEN)
+        )
     return {finding.quantity: finding for finding in report.findings}, report
 
 
@@ -81,13 +91,20 @@ class Small:
 
     def messages(self):
         """Topic, type, message and bag time [ns]."""
-        out = [(self.imu_topic, self.imu(stamp), self.recorded(stamp, k))
-               for k, stamp in enumerate(map(int, self.imu_stamps()))]
+        out = [
+            (self.imu_topic, self.imu(stamp), self.recorded(stamp, k))
+            for k, stamp in enumerate(map(int, self.imu_stamps()))
+        ]
         for stamp in map(int, self.image_stamps()):
-            out += [(self.info_topic, self.info(stamp), stamp),
-                    (self.image_topic, self.image(stamp), stamp)]
-        return [(topic, message.__msgtype__, message, at + 2 * MS)
-                for topic, message, at in out if topic]
+            out += [
+                (self.info_topic, self.info(stamp), stamp),
+                (self.image_topic, self.image(stamp), stamp),
+            ]
+        return [
+            (topic, message.__msgtype__, message, at + 2 * MS)
+            for topic, message, at in out
+            if topic
+        ]
 
     def write(self, path):
         with BagWriter(path) as bag:
@@ -108,14 +125,18 @@ def test_a_good_bag_has_no_warning(tmp_path):
     findings, report = checked(Small().write(tmp_path / 'bag'))
     # The camera does not move: but for the bias nothing is known, and nothing of that is ok.
     assert {f.quantity for f in report.findings if f.state is not FindingState.OK} == {
-        'pairs', 'gyro at rest', *(quantity.name for quantity in QUANTITIES)} - {'gyro_bias'}
+        'pairs',
+        'gyro at rest',
+        *(quantity.name for quantity in QUANTITIES),
+    } - {'gyro_bias'}
     assert {f.state for f in report.findings} == {FindingState.OK, FindingState.UNKNOWN}
     assert findings['image rate'].measured['rate_hz'] == pytest.approx(10.0)
     assert findings['imu rate'].measured['rate_hz'] == pytest.approx(200.0)
     assert findings['gravity'].measured['mean_length_m_s2'] == pytest.approx(9.81, abs=0.2)
     # 0.02 s, 150 px and the median rate.
     assert findings['rolling shutter'].measured['median_px'] == pytest.approx(
-        0.02 * 150.0 * findings['gyro'].measured['median_rad_s'], rel=0.1)
+        0.02 * 150.0 * findings['gyro'].measured['median_rad_s'], rel=0.1
+    )
 
 
 def imu_stamps(change, **more):
@@ -135,8 +156,9 @@ def at_rest(self, t):
 
 
 def encoded(data, *more):
-    return lambda self, stamp_ns: outgoing.encoded_image_message(stamp_ns, 'camera', data, TYPES,
-                                                                 *more)
+    return lambda self, stamp_ns: outgoing.encoded_image_message(
+        stamp_ns, 'camera', data, TYPES, *more
+    )
 
 
 def strange(self, stamp_ns):
@@ -153,7 +175,8 @@ def uncalibrated(self, stamp_ns):
 
 def of_another_size(self, stamp_ns):
     camera = RollingShutterCamera(
-        width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5, readout_time=0.02)
+        width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5, readout_time=0.02
+    )
     return outgoing.camera_info_message(stamp_ns, 'camera', camera, None, TYPES)
 
 
@@ -167,52 +190,122 @@ BROKEN = {
     'rectified': ({'image_topic': '/camera/image_rect'}, 'images', F, '(raw)'),
     'unknown encoding': ({'image': strange}, 'images', F, {'bad_images': 40, 'sizes': []}),
     'video': ({'image': encoded(b'\x00\x00\x00\x01\x67' * 20, 'h264')}, 'images', F, 'JPEG'),
-    'compressed': ({'image': encoded(build.jpeg(PIXELS))}, 'transport', W,
-                   'image_transport: compressed'),
+    'compressed': (
+        {'image': encoded(build.jpeg(PIXELS))},
+        'transport',
+        W,
+        'image_transport: compressed',
+    ),
     'uncalibrated': ({'info': uncalibrated}, 'calibration', F, 'camera_matrix'),
     'calibration of another size': ({'info': of_another_size}, 'calibration', F, {'fx': 300.0}),
-    'lost images': (image_stamps(lambda t: np.delete(t, [5, 6, 7, 15, 16, 22])), 'image rate',
-                    W, {'missed': 6, 'gaps': 3}),
+    'lost images': (
+        image_stamps(lambda t: np.delete(t, [5, 6, 7, 15, 16, 22])),
+        'image rate',
+        W,
+        {'missed': 6, 'gaps': 3},
+    ),
     'one image': (image_stamps(lambda t: t[:1]), 'image rate', F, {'count': 1}),
-    'stamps of arrival': (image_stamps(lambda t: t + np.random.default_rng(2).integers(
-        0, 60 * MS, len(t))), 'image stamps', W, {'jitter_s': CLOSE(0.027, abs=0.01)}),
-    'equal stamps': (image_stamps(lambda t: np.repeat(START, 40)), 'image stamps', F,
-                     {'repeated': 39}),
-    'gaps': (imu_stamps(lambda t: t[np.abs(t - START - 1100 * MS) >= 101 * MS]), 'imu rate', W,
-             {'gaps': 1, 'longest_step_s': CLOSE(0.21)}),
+    'stamps of arrival': (
+        image_stamps(lambda t: t + np.random.default_rng(2).integers(0, 60 * MS, len(t))),
+        'image stamps',
+        W,
+        {'jitter_s': CLOSE(0.027, abs=0.01)},
+    ),
+    'equal stamps': (
+        image_stamps(lambda t: np.repeat(START, 40)),
+        'image stamps',
+        F,
+        {'repeated': 39},
+    ),
+    'gaps': (
+        imu_stamps(lambda t: t[np.abs(t - START - 1100 * MS) >= 101 * MS]),
+        'imu rate',
+        W,
+        {'gaps': 1, 'longest_step_s': CLOSE(0.21)},
+    ),
     'slow imu': (imu_stamps(lambda t: t[::4]), 'imu rate', W, {'rate_hz': CLOSE(50.0)}),
     'very slow imu': (imu_stamps(lambda t: t[::20]), 'imu rate', F, {'rate_hz': CLOSE(10.0)}),
     'slow images': (image_stamps(lambda t: t[::4]), 'image rate', W, {'rate_hz': CLOSE(2.5)}),
     'no accelerometer': ({'force': lambda self, t: None}, 'gravity', W, '--accel-topic'),
-    'order': (imu_stamps(lambda t: t[[*range(300), 301, 300, *range(302, len(t))]],
-                         recorded=regularly), 'imu stamps', W, {'backwards': 1}),
+    'order': (
+        imu_stamps(lambda t: t[[*range(300), 301, 300, *range(302, len(t))]], recorded=regularly),
+        'imu stamps',
+        W,
+        {'backwards': 1},
+    ),
     'repeated': (imu_stamps(lambda t: np.repeat(t, 2)), 'imu stamps', F, {'repeated': 840}),
-    'clock set back': (imu_stamps(lambda t: np.concatenate([t[:400], t[400:] - 1500 * MS]),
-                                  recorded=regularly), 'imu stamps', W,
-                       {'furthest_back_s': CLOSE(1.495)}),
-    'other clock': (imu_stamps(lambda t: t - START + 7 * MS,
-                               recorded=lambda self, stamp, k: stamp + START), 'clocks', F,
-                    'time_offset: '),
-    'imu ends early': (imu_stamps(lambda t: t[:400]), 'clocks', W,
-                       {'common_s': CLOSE(1.9, abs=0.01)}),
-    'no gyro': ({'imu': lambda self, stamp_ns: outgoing.imu_message(
-        stamp_ns, 'imu', None, (0.0, -9.81, 0.0), TYPES)}, 'gyro', F, '--imu-topic'),
-    'stuck gyro': ({'rate': lambda self, t: [0.1, 0.0, 0.0]}, 'gyro', F,
-                   {'median_rad_s': CLOSE(0.1)}),
-    'degrees per second': ({'rate': lambda self, t: 5000.0 * Small.rate(self, t)}, 'gyro', F,
-                           'rad/s'),
-    'bias': ({'rate': at_rest, 'force': lambda self, t: [0.0, -9.81, 0.0]}, 'gyro at rest', W,
-             'gyro_bias: [0.0'),
+    'clock set back': (
+        imu_stamps(lambda t: np.concatenate([t[:400], t[400:] - 1500 * MS]), recorded=regularly),
+        'imu stamps',
+        W,
+        {'furthest_back_s': CLOSE(1.495)},
+    ),
+    'other clock': (
+        imu_stamps(lambda t: t - START + 7 * MS, recorded=lambda self, stamp, k: stamp + START),
+        'clocks',
+        F,
+        'time_offset: ',
+    ),
+    'imu ends early': (
+        imu_stamps(lambda t: t[:400]),
+        'clocks',
+        W,
+        {'common_s': CLOSE(1.9, abs=0.01)},
+    ),
+    'no gyro': (
+        {
+            'imu': lambda self, stamp_ns: outgoing.imu_message(
+                stamp_ns, 'imu', None, (0.0, -9.81, 0.0), TYPES
+            )
+        },
+        'gyro',
+        F,
+        '--imu-topic',
+    ),
+    'stuck gyro': (
+        {'rate': lambda self, t: [0.1, 0.0, 0.0]},
+        'gyro',
+        F,
+        {'median_rad_s': CLOSE(0.1)},
+    ),
+    'degrees per second': (
+        {'rate': lambda self, t: 5000.0 * Small.rate(self, t)},
+        'gyro',
+        F,
+        'rad/s',
+    ),
+    'bias': (
+        {'rate': at_rest, 'force': lambda self, t: [0.0, -9.81, 0.0]},
+        'gyro at rest',
+        W,
+        'gyro_bias: [0.0',
+    ),
     'in g': ({'force': lambda self, t: [0.0, -1.0, 0.01]}, 'gravity', F, 'm/s^2'),
     'gravity removed': ({'force': lambda self, t: [0.3, 0.2, 0.01]}, 'gravity', F, 'REP-145'),
-    'accelerometer off': ({'force': lambda self, t: [0.0, -11.5, 0.0]}, 'gravity', W,
-                          {'mean_length_m_s2': CLOSE(11.5)}),
-    'large images': ({'pixels': np.zeros((800, 800), np.uint8), 'seconds': 0.5}, 'live transport',
-                     W, 'fastdds.xml'),
-    'frozen camera': ({'image': lambda self, stamp_ns: mono8(stamp_ns, PIXELS)}, 'pairs', F,
-                      {'images': 1, 'pairs': 0}),
-    'no texture': ({'pixels': np.full((120, 160), 90, np.uint8)}, 'texture', F,
-                   {'median_matches': CLOSE(0.0, abs=14.0)}),
+    'accelerometer off': (
+        {'force': lambda self, t: [0.0, -11.5, 0.0]},
+        'gravity',
+        W,
+        {'mean_length_m_s2': CLOSE(11.5)},
+    ),
+    'large images': (
+        {'pixels': np.zeros((800, 800), np.uint8), 'seconds': 0.5},
+        'live transport',
+        W,
+        'fastdds.xml',
+    ),
+    'frozen camera': (
+        {'image': lambda self, stamp_ns: mono8(stamp_ns, PIXELS)},
+        'pairs',
+        F,
+        {'images': 1, 'pairs': 0},
+    ),
+    'no texture': (
+        {'pixels': np.full((120, 160), 90, np.uint8)},
+        'texture',
+        F,
+        {'median_matches': CLOSE(0.0, abs=14.0)},
+    ),
 }
 
 
@@ -230,15 +323,19 @@ def test_a_broken_recording_has_its_finding(case, tmp_path):
     assert report.failed == any(f.state is F for f in report.findings)
     json.dumps(report.to_mapping(), allow_nan=False)
     assert len(report.lines(80)) > len(findings)
-    assert max(map(len, report.lines(100)[:-1])) <= 100     # the last one has the path
+    assert max(map(len, report.lines(100)[:-1])) <= 100  # the last one has the path
 
 
 @pytest.mark.parametrize('changes', [{'info': uncalibrated}, {'info_topic': ''}])
 def test_intrinsics_by_parameters(changes, tmp_path):
     """As good as those of a CameraInfo, in whose place they are used."""
-    configured = Parameters.from_mapping(GIVEN | {
-        'camera_matrix': (151.0, 0.0, 79.5, 0.0, 151.0, 59.5, 0.0, 0.0, 1.0),
-        'distortion_coefficients': (-0.1, 0.0, 0.0, 0.0)})
+    configured = Parameters.from_mapping(
+        GIVEN
+        | {
+            'camera_matrix': (151.0, 0.0, 79.5, 0.0, 151.0, 59.5, 0.0, 0.0, 1.0),
+            'distortion_coefficients': (-0.1, 0.0, 0.0, 0.0),
+        }
+    )
     findings, report = checked(broken(**changes).write(tmp_path / 'bag'), configured)
     assert not report.failed
     assert findings['calibration'].measured['fx'] == 151.0
@@ -253,10 +350,12 @@ def test_missing_parameters_are_a_warning(tmp_path):
     assert findings['parameters'].measured['missing'] == ['readout_time', 'quat_cam_imu_xyzw']
     # They are not observable in this recording, either.
     assert [findings[name].state for name in ('axes', 'readout_time', 'rolling shutter')] == [
-        FindingState.UNKNOWN] * 3
+        FindingState.UNKNOWN
+    ] * 3
 
 
 # -- images against the gyro -----------------------------------------------------------------
+
 
 @pytest.fixture(scope='module')
 def parameters(bundled_bag):
@@ -279,16 +378,22 @@ def test_the_bundled_bag_is_good(bundled_bag, parameters):
         assert abs(finding.estimated - finding.configured) < 4.0 * finding.sigma
     assert findings['time_offset'].sigma < 2e-3
     assert findings['parameters'].measured['nearest'] == (
-        'cam x = -imu y, cam y = -imu z, cam z = +imu x')
+        'cam x = -imu y, cam y = -imu z, cam z = +imu x'
+    )
     assert findings['pairs'].measured['poses'] > 20
     assert findings['rolling shutter'].measured['p95_px'] > 1.0
 
 
-@pytest.mark.parametrize('changes, name, truth, tolerance', [
-    ({'readout_time': 0.06}, 'readout_time', 0.03, 0.006),
-    ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 5.0)])
-def test_parameters_that_contradict_the_recording(changes, name, truth, tolerance, short_bag,
-                                                  parameters):
+@pytest.mark.parametrize(
+    'changes, name, truth, tolerance',
+    [
+        ({'readout_time': 0.06}, 'readout_time', 0.03, 0.006),
+        ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 5.0),
+    ],
+)
+def test_parameters_that_contradict_the_recording(
+    changes, name, truth, tolerance, short_bag, parameters
+):
     # Parameters that the node would track are evaluated as configured.
     tracking = {'track_time_offset': True, 'track_readout_time': True}
     findings, report = checked(short_bag, parameters.updated(tracking | changes))
@@ -321,49 +426,90 @@ def test_missing_parameters_are_estimated(short_bag):
     assert not report.failed
     assert findings['axes'].state is findings['readout_time'].state is FindingState.UNKNOWN
     assert 'cam x = -imu y, cam y = -imu z, cam z = +imu x' in findings['axes'].message
-    assert 'bottom' in findings['axes'].message   # direction of gravity
+    assert 'bottom' in findings['axes'].message  # direction of gravity
     readout = findings['readout_time']
     assert (readout.configured, readout.estimated) == (None, pytest.approx(0.03, abs=2e-3))
     assert abs(findings['time_offset'].estimated) < 3e-3
     assert findings['rolling shutter'].measured['readout_s'] == pytest.approx(0.03, abs=2e-3)
 
 
-@pytest.mark.parametrize('state, estimated, expected', [
-    ('ok', 4.5e-3, 'ok'), ('ok', 9e-3, 'warning'), ('suspect', 9e-3, 'warning'),
-    ('wrong', 9e-3, 'failure'), ('suspect', 0.018, 'failure'), ('unknown', None, 'unknown')])
+@pytest.mark.parametrize(
+    'state, estimated, expected',
+    [
+        ('ok', 4.5e-3, 'ok'),
+        ('ok', 9e-3, 'warning'),
+        ('suspect', 9e-3, 'warning'),
+        ('wrong', 9e-3, 'failure'),
+        ('suspect', 0.018, 'failure'),
+        ('unknown', None, 'unknown'),
+    ],
+)
 def test_a_certain_deviation_counts_though_no_pose_suffers(state, estimated, expected):
     """By its sigma (1 ms) and its limit of 12 ms."""
     finding = Finding('time_offset', FindingState(state), '', '', 4e-3, estimated, 1e-3, 's', True)
-    found, = quantity_findings(Assessment((finding,)), '')
+    (found,) = quantity_findings(Assessment((finding,)), '')
     assert found.state.verdict == expected
     assert bool(found.fix) is (found.state is not finding.state or expected == 'failure')
 
 
-@pytest.mark.parametrize('name, configured, estimated, state', [
-    ('axes', 0.0, 2.9, W), ('axes', 0.0, 3.1, F), ('focal_length', 100.0, 111.0, W),
-    ('focal_length', 100.0, 113.0, F), ('readout_direction', 0.03, -0.03, F)])
+@pytest.mark.parametrize(
+    'name, configured, estimated, state',
+    [
+        ('axes', 0.0, 2.9, W),
+        ('axes', 0.0, 3.1, F),
+        ('focal_length', 100.0, 111.0, W),
+        ('focal_length', 100.0, 113.0, F),
+        ('readout_direction', 0.03, -0.03, F),
+    ],
+)
 def test_limits_are_in_the_units_of_the_quantity(name, configured, estimated, state):
-    finding = Finding(name, W, '', '', configured, estimated, 0.01 * configured + 1e-3,
-                      {'axes': 'deg', 'focal_length': 'px'}.get(name, 's'), True)
+    finding = Finding(
+        name,
+        W,
+        '',
+        '',
+        configured,
+        estimated,
+        0.01 * configured + 1e-3,
+        {'axes': 'deg', 'focal_length': 'px'}.get(name, 's'),
+        True,
+    )
     assert next(quantity_findings(Assessment((finding,)), '')).state is state
 
 
 # -- contradictions by a calibration: conventions of rows, signs and exposures -----------------
 
-INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5,
-                        image_width=640, image_height=480)
+INTRINSICS = Intrinsics(
+    width=640,
+    height=480,
+    fx=500.0,
+    fy=500.0,
+    cx=319.5,
+    cy=239.5,
+    image_width=640,
+    image_height=480,
+)
 INTERVAL = 0.05
-TRUE = {'readout_time': 0.024, 'time_offset': -0.03, 'exposure_time': 0.012,
-        'quat_cam_imu_xyzw': (0.5, -0.5, 0.5, -0.5), 'time_offset_per_interval': -0.5,
-        'time_offset_reference_interval': 0.04}
+TRUE = {
+    'readout_time': 0.024,
+    'time_offset': -0.03,
+    'exposure_time': 0.012,
+    'quat_cam_imu_xyzw': (0.5, -0.5, 0.5, -0.5),
+    'time_offset_per_interval': -0.5,
+    'time_offset_reference_interval': 0.04,
+}
 
 
 def contradictions(found, row, direction, exposure, **changes):
     """Findings on parameters of a convention, by a calibration."""
-    configured = Parameters.from_mapping(TRUE | {
-        'stamp_row': row, 'readout_direction': direction, 'stamp_exposure': exposure} | changes)
-    return check_recording.contradicted(found, configured.sensor,
-                                     sensor_model(INTRINSICS, configured.sensor))
+    configured = Parameters.from_mapping(
+        TRUE
+        | {'stamp_row': row, 'readout_direction': direction, 'stamp_exposure': exposure}
+        | changes
+    )
+    return check_recording.contradicted(
+        found, configured.sensor, sensor_model(INTRINSICS, configured.sensor)
+    )
 
 
 def found_by(row, direction, exposure, offset_observable=True):
@@ -375,32 +521,38 @@ def found_by(row, direction, exposure, offset_observable=True):
     row_0 = at_interval + middle_of_exposure - stamped / 480.0 * signed
     R = Rotation.from_quat(TRUE['quat_cam_imu_xyzw']).as_matrix()
     return SimpleNamespace(
-        R_cam_imu=R, rotation_sigma=np.full(3, 1e-3), frame_interval=INTERVAL,
-        quat_cam_imu_xyzw=TRUE['quat_cam_imu_xyzw'], readout_time=Estimate(signed, 3e-4, True),
-        time_offset=Estimate(row_0, 2e-4, offset_observable))
+        R_cam_imu=R,
+        rotation_sigma=np.full(3, 1e-3),
+        frame_interval=INTERVAL,
+        quat_cam_imu_xyzw=TRUE['quat_cam_imu_xyzw'],
+        readout_time=Estimate(signed, 3e-4, True),
+        time_offset=Estimate(row_0, 2e-4, offset_observable),
+    )
 
 
-@pytest.mark.parametrize('convention', [*itertools.product(
-    ('first', 'middle', 'last'), ('down', 'up'), ('start', 'middle', 'end'))])
+@pytest.mark.parametrize(
+    'convention',
+    [*itertools.product(('first', 'middle', 'last'), ('down', 'up'), ('start', 'middle', 'end'))],
+)
 def test_a_calibration_contradicts_wrong_parameters_in_every_convention(convention):
     found = found_by(*convention)
     assert contradictions(found, *convention) == ()
-    assert contradictions(found, *convention, time_offset=-0.025) == ()   # a small difference
+    assert contradictions(found, *convention, time_offset=-0.025) == ()  # a small difference
     unknown = found_by(*convention, offset_observable=False)
     assert contradictions(unknown, *convention, time_offset=0.2) == ()
-    offset, = contradictions(found, *convention, time_offset=0.01)
+    (offset,) = contradictions(found, *convention, time_offset=0.01)
     assert (offset.quantity, offset.configured) == ('time_offset', 0.01)
     assert offset.estimated == pytest.approx(-0.03, abs=1e-6)
     assert offset.fix == 'set time_offset: -0.0300'
-    readout, = contradictions(found, *convention, readout_time=0.05)
+    (readout,) = contradictions(found, *convention, readout_time=0.05)
     assert (readout.quantity, readout.configured) == ('readout_time', pytest.approx(0.05))
     assert readout.estimated == pytest.approx(0.024, abs=1e-9)
-    axes, = contradictions(found, *convention, quat_cam_imu_xyzw=(0.0, 0.0, 0.0, 1.0))
+    (axes,) = contradictions(found, *convention, quat_cam_imu_xyzw=(0.0, 0.0, 0.0, 1.0))
     assert axes.quantity == 'axes' and axes.estimated == pytest.approx(120.0)
     assert axes.fix == 'set quat_cam_imu_xyzw: [0.5, -0.5, 0.5, -0.5]'
     row, direction, exposure = convention
-    if row == 'middle':     # which keeps its time
-        reverse, = contradictions(found, row, {'down': 'up', 'up': 'down'}[direction], exposure)
+    if row == 'middle':  # which keeps its time
+        (reverse,) = contradictions(found, row, {'down': 'up', 'up': 'down'}[direction], exposure)
         assert reverse.quantity == 'readout_direction'
         assert reverse.fix == f'set readout_direction: {direction}'
 
@@ -444,17 +596,38 @@ def test_gross_errors_in_little_light(converted):
 
 NO_TIME = ros.QosTime(0, 0)
 BEST_EFFORT = ros.Qos(
-    ros.QosHistory.KEEP_LAST, 5, ros.QosReliability.BEST_EFFORT, ros.QosDurability.VOLATILE,
-    NO_TIME, NO_TIME, ros.QosLiveliness.AUTOMATIC, NO_TIME, False)
+    ros.QosHistory.KEEP_LAST,
+    5,
+    ros.QosReliability.BEST_EFFORT,
+    ros.QosDurability.VOLATILE,
+    NO_TIME,
+    NO_TIME,
+    ros.QosLiveliness.AUTOMATIC,
+    NO_TIME,
+    False,
+)
 
 
-@pytest.mark.parametrize('kind, offered, reliability', [
-    ('sqlite3', {'offered_qos_profiles': [BEST_EFFORT]}, 'best effort'),
-    ('mcap', {'offered_qos_profiles': [BEST_EFFORT]}, 'best effort'), ('ros1', {}, None)])
+@pytest.mark.parametrize(
+    'kind, offered, reliability',
+    [
+        ('sqlite3', {'offered_qos_profiles': [BEST_EFFORT]}, 'best effort'),
+        ('mcap', {'offered_qos_profiles': [BEST_EFFORT]}, 'best effort'),
+        ('ros1', {}, None),
+    ],
+)
 def test_every_container(kind, offered, reliability, tmp_path):
-    findings, _ = checked(write_kind(kind, tmp_path, [
-        (topic, msgtype, message, at - STAMP_NS)
-        for topic, msgtype, message, at in broken(seconds=1.0).messages()], **offered))
+    findings, _ = checked(
+        write_kind(
+            kind,
+            tmp_path,
+            [
+                (topic, msgtype, message, at - STAMP_NS)
+                for topic, msgtype, message, at in broken(seconds=1.0).messages()
+            ],
+            **offered,
+        )
+    )
     assert findings['image rate'].measured['count'] == 10
     assert findings['imu rate'].measured['rate_hz'] == pytest.approx(200.0)
     assert findings['live transport'].measured['reliability'] == reliability
@@ -476,11 +649,17 @@ def test_command_line(tmp_path, capsys):
     assert {f['name']: f['verdict'] for f in report['findings']}['calibration'] == 'failure'
 
 
-@pytest.mark.parametrize('arguments, message', [
-    (['nowhere'], 'there is no bag'), (['BAG', '--imu-topic', '/nothing'], '/nothing'),
-    (['BAG', '--set', 'readout=1'], 'readout_time'), (['BAG', '--params', 'no.yaml'], 'no.yaml'),
-    (['BAG', '--image-topic', '/imu'], 'must be'), (['DAMAGED'], 'mcap'),
-])
+@pytest.mark.parametrize(
+    'arguments, message',
+    [
+        (['nowhere'], 'there is no bag'),
+        (['BAG', '--imu-topic', '/nothing'], '/nothing'),
+        (['BAG', '--set', 'readout=1'], 'readout_time'),
+        (['BAG', '--params', 'no.yaml'], 'no.yaml'),
+        (['BAG', '--image-topic', '/imu'], 'must be'),
+        (['DAMAGED'], 'mcap'),
+    ],
+)
 def test_bad_usage(arguments, message, tmp_path, refused):
     for name in ('BAG', 'DAMAGED'):
         broken(seconds=0.3).write(tmp_path / name)

@@ -20,10 +20,13 @@ from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.output_files import beside, written
 
 CONFIG = ROOT / 'config'
+
+
 def test_template_is_up_to_date_and_holds_every_parameter_at_its_default():
     text = parameter_template()
     assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == text, (
-        'run python -m rs_relpose_ros.config.files config/relpose.yaml')
+        'run python -m rs_relpose_ros.config.files config/relpose.yaml'
+    )
     values = yaml.safe_load(text)['/**']['ros__parameters']
     for name, default, _ in Parameters.declarations():
         if default is None:
@@ -72,14 +75,32 @@ def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
     pytest.fail(f'{lost} of {count} images were lost')
 
 
-@pytest.mark.parametrize(('name', 'texts'), [
-    # What the node subscribes to is remapped; the shipped profile, unless the user has one.
-    ('relpose', ["'relpose_node'", "('image', Path", "('camera_info', Path", "('imu', argument",
-                 "('calibration', 'relpose", "('accel', argument", "'config', 'fastdds.xml'"]),
-    *((name, ["'relpose.launch.py'", f"'{nodes}'"]) for name, nodes in (
-        ('global_shutter', 'global_shutter_node'),
-        ('relpose_and_global_shutter', 'relpose_node,global_shutter_node'),
-        ('odometry', 'relpose_node,odometry_node')))])
+@pytest.mark.parametrize(
+    ('name', 'texts'),
+    [
+        # What the node subscribes to is remapped; the shipped profile, unless the user has one.
+        (
+            'relpose',
+            [
+                "'relpose_node'",
+                "('image', Path",
+                "('camera_info', Path",
+                "('imu', argument",
+                "('calibration', 'relpose",
+                "('accel', argument",
+                "'config', 'fastdds.xml'",
+            ],
+        ),
+        *(
+            (name, ["'relpose.launch.py'", f"'{nodes}'"])
+            for name, nodes in (
+                ('global_shutter', 'global_shutter_node'),
+                ('relpose_and_global_shutter', 'relpose_node,global_shutter_node'),
+                ('odometry', 'relpose_node,odometry_node'),
+            )
+        ),
+    ],
+)
 def test_launch_files(name, texts):
     """Without ROS's launch, which is in no wheel, by their text alone."""
     text = (ROOT / 'launch' / f'{name}.launch.py').read_text(encoding='utf-8')
@@ -97,13 +118,19 @@ def test_launch_file_describes_its_arguments(path):
 
 
 def test_layouts_show_topics_of_the_nodes_by_their_types():
-    types = {'/relpose_node/debug_image': 'sensor_msgs/msg/Image', '/diagnostics': '',
-             '/odometry_node/path': 'nav_msgs/msg/Path',
-             '/odometry_node/odometry': 'nav_msgs/msg/Odometry',
-             **{f'/relpose_node/{name}': msgtype for name, msgtype in PAIR_TOPICS.items()}}
+    types = {
+        '/relpose_node/debug_image': 'sensor_msgs/msg/Image',
+        '/diagnostics': '',
+        '/odometry_node/path': 'nav_msgs/msg/Path',
+        '/odometry_node/odometry': 'nav_msgs/msg/Odometry',
+        **{f'/relpose_node/{name}': msgtype for name, msgtype in PAIR_TOPICS.items()},
+    }
     rviz = yaml.safe_load((CONFIG / 'rs_relpose.rviz').read_text())['Visualization Manager']
-    shown = {display['Topic']['Value']: display['Class'].split('/')[1]
-             for display in rviz['Displays'] if 'Topic' in display}
+    shown = {
+        display['Topic']['Value']: display['Class'].split('/')[1]
+        for display in rviz['Displays']
+        if 'Topic' in display
+    }
     assert len(shown) >= 4 and shown == {name: types[name].split('/')[-1] for name in shown}
     for value in re.findall(r'"(/[^"]+)"', (CONFIG / 'rs_relpose_foxglove.json').read_text()):
         topic, *fields = value.split('.')
@@ -119,10 +146,11 @@ def test_an_exposure_is_given_once():
 
 # -- files that are complete, or not there -------------------------------------------------------
 
+
 def test_a_file_has_its_name_once_it_is_complete(tmp_path):
     path = tmp_path / 'table.csv'
     path.write_text('old')
-    with pytest.raises(KeyboardInterrupt), written(path) as file:   # as if it were killed
+    with pytest.raises(KeyboardInterrupt), written(path) as file:  # as if it were killed
         file.write('half\n')
         assert (tmp_path / 'table.csv.part').read_text() == 'half\n'
         raise KeyboardInterrupt
@@ -130,7 +158,8 @@ def test_a_file_has_its_name_once_it_is_complete(tmp_path):
     with written(path) as file:
         file.write('new\n')
     assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [
-        ('table.csv', 'new\n')]
+        ('table.csv', 'new\n')
+    ]
 
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
@@ -146,6 +175,6 @@ def test_an_error_of_a_full_disk_has_the_path(tmp_path):
     with pytest.raises(OSError, match='No space left') as found, beside(tmp_path / 'out'):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert found.value.filename == str(tmp_path / 'out') and not list(tmp_path.iterdir())
-    with pytest.raises(FileNotFoundError) as found, beside(tmp_path / 'out'):   # of an input
+    with pytest.raises(FileNotFoundError) as found, beside(tmp_path / 'out'):  # of an input
         (tmp_path / 'input').read_text()
     assert found.value.filename == str(tmp_path / 'input')

@@ -86,8 +86,14 @@ def converted(source: str, path: Path, bag: Path, *options: str) -> Converted:
     return Converted(messages, text, read_parameters(file))
 
 
-def refused(source: str, path: Path, bag: Path, words: str, *options: str,
-            kind: type[RsRelposeError] = RsRelposeError) -> None:
+def refused(
+    source: str,
+    path: Path,
+    bag: Path,
+    words: str,
+    *options: str,
+    kind: type[RsRelposeError] = RsRelposeError,
+) -> None:
     """One line, and no file."""
     arguments = ['convert', source, str(path), str(bag), *options]
     with pytest.raises(kind) as caught:
@@ -99,10 +105,12 @@ def refused(source: str, path: Path, bag: Path, words: str, *options: str,
 
 # --- videos
 
+
 def test_frames_keep_their_varying_times(tmp_path):
     read = converted('video', made.make_video(tmp_path), tmp_path / 'bag')
     assert [stamp - START_NS for stamp in read.stamps()] == [
-        round(tick * 1e9 / made.TICKS_PER_SECOND) for tick in made.TICKS]
+        round(tick * 1e9 / made.TICKS_PER_SECOND) for tick in made.TICKS
+    ]
     for number in range(len(made.TICKS)):
         assert read.pixels(number).shape == (48, 64)
         assert abs(np.median(read.pixels(number)) - made.brightness(number)) < 6
@@ -111,23 +119,31 @@ def test_frames_keep_their_varying_times(tmp_path):
     assert [sample.stamp_ns - START_NS for sample in samples] == [5_000_000 * k for k in range(60)]
     # x right is minus left, y down minus up, z forwards minus backwards.
     np.testing.assert_allclose(samples[7].angular_velocity, (0.2, -0.1, -0.3), rtol=1e-6)
-    np.testing.assert_allclose(samples[7].linear_acceleration,
-                               9.80665 * np.array([-0.1, -1.0, 0.2]), rtol=1e-6)
+    np.testing.assert_allclose(
+        samples[7].linear_acceleration, 9.80665 * np.array([-0.1, -1.0, 0.2]), rtol=1e-6
+    )
     np.testing.assert_array_equal(read.axes.as_matrix(), np.eye(3))
 
 
 def test_rotation_for_display_is_not_applied(tmp_path):
     path = made.make_video(tmp_path)
     made.rotate_for_display(path)
-    assert cv2.VideoCapture(str(path)).read()[1].shape[:2] == (64, 48)   # OpenCV rotates it
+    assert cv2.VideoCapture(str(path)).read()[1].shape[:2] == (64, 48)  # OpenCV rotates it
     assert converted('video', path, tmp_path / 'bag').pixels(0).shape == (48, 64)
 
 
-@pytest.mark.parametrize('header, expected, source', [
-    ({}, (None, 'down'), ''),
-    ({'frame_readout_time': 15.25}, (0.01525, 'down'), 'Reported by the file'),
-    ({'frame_readout_time': 15.25, 'frame_readout_direction': 'BottomToTop'}, (0.01525, 'up'),
-     'Reported by the file')])
+@pytest.mark.parametrize(
+    'header, expected, source',
+    [
+        ({}, (None, 'down'), ''),
+        ({'frame_readout_time': 15.25}, (0.01525, 'down'), 'Reported by the file'),
+        (
+            {'frame_readout_time': 15.25, 'frame_readout_direction': 'BottomToTop'},
+            (0.01525, 'up'),
+            'Reported by the file',
+        ),
+    ],
+)
 def test_readout_time_of_a_video(tmp_path, capsys, header, expected, source):
     read = converted('video', made.make_video(tmp_path, **header), tmp_path / 'bag')
     assert read.readout == expected
@@ -136,11 +152,17 @@ def test_readout_time_of_a_video(tmp_path, capsys, header, expected, source):
 
 
 PROFILE = {
-    'camera_brand': 'ACME', 'camera_model': 'Model-1', 'fps': 30.1, 'frame_readout_time': -12.5,
-    'calib_dimension': {'w': 128, 'h': 96}, 'orig_dimension': {'w': 64, 'h': 48},
+    'camera_brand': 'ACME',
+    'camera_model': 'Model-1',
+    'fps': 30.1,
+    'frame_readout_time': -12.5,
+    'calib_dimension': {'w': 128, 'h': 96},
+    'orig_dimension': {'w': 64, 'h': 48},
     'fisheye_params': {
         'camera_matrix': [[100.5, 0.0, 63.5], [0.0, 101.5, 47.5], [0.0, 0.0, 1.0]],
-        'distortion_coeffs': [0.1, -0.02, 0.003, -0.0004]}}
+        'distortion_coeffs': [0.1, -0.02, 0.003, -0.0004],
+    },
+}
 OF_THE_VIDEO = {'fps': 6 * made.TICKS_PER_SECOND / made.TICKS[-1]}
 
 
@@ -150,18 +172,28 @@ def write_profile(path: Path, **changes: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize('place, header, readout', [
-    ('Acme/one.json', {}, (0.0125, 'up')), ('', {}, (0.0125, 'up')),
-    # A value that the file reports is preferred to a guess.
-    ('Acme/one.json', {'frame_readout_time': 15.25}, (0.01525, 'down'))])
+@pytest.mark.parametrize(
+    'place, header, readout',
+    [
+        ('Acme/one.json', {}, (0.0125, 'up')),
+        ('', {}, (0.0125, 'up')),
+        # A value that the file reports is preferred to a guess.
+        ('Acme/one.json', {'frame_readout_time': 15.25}, (0.01525, 'down')),
+    ],
+)
 def test_lens_profile(tmp_path, place, header, readout):
     folder = tmp_path / 'profiles'
     write_profile(folder / 'Acme' / 'one.json', **OF_THE_VIDEO)
     write_profile(folder / 'Acme' / 'rate.json')
     write_profile(folder / 'other.json', camera_model='Model 2', **OF_THE_VIDEO)
     (folder / 'list.json').write_text('{"version": 1}')
-    read = converted('video', made.make_video(tmp_path, **header), tmp_path / 'bag',
-                     '--lens-profile', str(folder / place))
+    read = converted(
+        'video',
+        made.make_video(tmp_path, **header),
+        tmp_path / 'bag',
+        '--lens-profile',
+        str(folder / place),
+    )
     assert (read.intrinsics.width, read.intrinsics.height) == (64, 48)
     assert (read.intrinsics.fx, read.intrinsics.fy) == (50.25, 50.75)
     # The middle of the image is the middle at every scale.
@@ -172,18 +204,35 @@ def test_lens_profile(tmp_path, place, header, readout):
     assert ('A GUESS' in read.text and 'lens profile one.json' in read.text) == (not header)
 
 
-@pytest.mark.parametrize('changes, words', [
-    ({'calib_dimension': {'w': 128, 'h': 72}}, 'another aspect ratio'),
-    ({'distortion_model': 'gopro'}, "distortion model 'gopro' is not supported"),
-    ({'input_horizontal_stretch': 1.33}, 'input_horizontal_stretch must be 1'),
-    ({'fisheye_params': {}}, 'no lens profile: it needs'),
-    ({'fisheye_params': {**PROFILE['fisheye_params'], 'distortion_coeffs': [0.1, 'x', 0, 0]}},
-     'no lens profile: it needs'),
-    ({'calib_dimension': {'w': 'x', 'h': 72}}, 'no lens profile: it needs'),
-    ({'frame_readout_time': 10012.5}, 'column by column')])
+@pytest.mark.parametrize(
+    'changes, words',
+    [
+        ({'calib_dimension': {'w': 128, 'h': 72}}, 'another aspect ratio'),
+        ({'distortion_model': 'gopro'}, "distortion model 'gopro' is not supported"),
+        ({'input_horizontal_stretch': 1.33}, 'input_horizontal_stretch must be 1'),
+        ({'fisheye_params': {}}, 'no lens profile: it needs'),
+        (
+            {
+                'fisheye_params': {
+                    **PROFILE['fisheye_params'],
+                    'distortion_coeffs': [0.1, 'x', 0, 0],
+                }
+            },
+            'no lens profile: it needs',
+        ),
+        ({'calib_dimension': {'w': 'x', 'h': 72}}, 'no lens profile: it needs'),
+        ({'frame_readout_time': 10012.5}, 'column by column'),
+    ],
+)
 def test_lens_profile_that_does_not_fit(tmp_path, changes, words):
-    refused('video', made.make_video(tmp_path), tmp_path / 'bag', words, '--lens-profile',
-            str(write_profile(tmp_path / 'one.json', **changes)))
+    refused(
+        'video',
+        made.make_video(tmp_path),
+        tmp_path / 'bag',
+        words,
+        '--lens-profile',
+        str(write_profile(tmp_path / 'one.json', **changes)),
+    )
 
 
 def test_lens_profiles_to_choose_from(tmp_path):
@@ -202,18 +251,25 @@ def test_lens_profiles_to_choose_from(tmp_path):
     check('a.json: no JSON')
 
 
-@pytest.mark.parametrize('module, package', [('telemetry_parser', 'telemetry-parser'),
-                                             ('av', 'av')])
+@pytest.mark.parametrize(
+    'module, package', [('telemetry_parser', 'telemetry-parser'), ('av', 'av')]
+)
 def test_library_that_is_not_installed(tmp_path, monkeypatch, module, package):
     path = made.make_video(tmp_path)
     monkeypatch.setitem(sys.modules, module, None)
-    refused('video', path, tmp_path / 'bag', f'need the Python package {package}, which is not '
-            'installed: pip install av telemetry-parser', kind=MissingInputError)
+    refused(
+        'video',
+        path,
+        tmp_path / 'bag',
+        f'need the Python package {package}, which is not '
+        'installed: pip install av telemetry-parser',
+        kind=MissingInputError,
+    )
 
 
 def cut_in_half(folder: Path) -> Path:
     path = made.make_video(folder)
-    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
 
 
@@ -226,26 +282,44 @@ def frames_overwritten(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize('make, words', [
-    (lambda folder: folder / 'absent.mp4', 'absent.mp4 is missing'),
-    (made.make_clip, 'has no telemetry'),
-    (lambda folder: made.make_clip(folder, {'EISE': 'Y'}), 'is stabilised in the camera'),
-    (lambda folder: made.make_clip(folder, {'EISE': 'N', 'EISA': 'HS HLevel'}),
-     'is stabilised in the camera'),
-    (lambda folder: made.make_clip(folder, {'EISE': 'N', 'EISA': 'N', 'MINF': 'HERO9 Black'}),
-     '(GoPro HERO9 Black) has no gyro'),
-    # Its reader panics at the end of the file.
-    (lambda folder: made.make_clip(folder, {'EISE': 'N'}, whole=False),
-     'telemetry-parser cannot read it'),
-    (lambda folder: made.make_video(folder, frame_readout_time=15.25,
-                                    frame_readout_direction='LeftToRight'), 'column by column'),
-    (cut_in_half, 'clip.mp4'), (frames_overwritten, 'clip.mp4')])
+@pytest.mark.parametrize(
+    'make, words',
+    [
+        (lambda folder: folder / 'absent.mp4', 'absent.mp4 is missing'),
+        (made.make_clip, 'has no telemetry'),
+        (lambda folder: made.make_clip(folder, {'EISE': 'Y'}), 'is stabilised in the camera'),
+        (
+            lambda folder: made.make_clip(folder, {'EISE': 'N', 'EISA': 'HS HLevel'}),
+            'is stabilised in the camera',
+        ),
+        (
+            lambda folder: made.make_clip(
+                folder, {'EISE': 'N', 'EISA': 'N', 'MINF': 'HERO9 Black'}
+            ),
+            '(GoPro HERO9 Black) has no gyro',
+        ),
+        # Its reader panics at the end of the file.
+        (
+            lambda folder: made.make_clip(folder, {'EISE': 'N'}, whole=False),
+            'telemetry-parser cannot read it',
+        ),
+        (
+            lambda folder: made.make_video(
+                folder, frame_readout_time=15.25, frame_readout_direction='LeftToRight'
+            ),
+            'column by column',
+        ),
+        (cut_in_half, 'clip.mp4'),
+        (frames_overwritten, 'clip.mp4'),
+    ],
+)
 def test_video_that_is_refused(tmp_path, make, words):
     pytest.importorskip('telemetry_parser', reason='needs the extra video')
     refused('video', make(tmp_path / 'in'), tmp_path / 'bag', words)
 
 
 # --- phones
+
 
 def test_posecam(tmp_path):
     read = converted('android', made.make_posecam(tmp_path / 'in'), tmp_path / 'bag')
@@ -269,8 +343,9 @@ def test_posecam(tmp_path):
     pose = read.of(TRUTH)[1].pose
     assert (pose.position.x, pose.position.y, pose.position.z) == (0.2, 0.2, 0.3)
     q = pose.orientation
-    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
-                               np.diag([1, -1, -1]), atol=1e-12)   # right, down, forwards
+    np.testing.assert_allclose(
+        Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), np.diag([1, -1, -1]), atol=1e-12
+    )  # right, down, forwards
 
 
 def test_jump_of_the_poses_ends_the_ground_truth(tmp_path, caplog):
@@ -281,7 +356,7 @@ def test_jump_of_the_poses_ends_the_ground_truth(tmp_path, caplog):
         read = converted('android', folder, tmp_path / 'bag')
     assert read.stamps(TRUTH) == made.STAMPS[2:]
     [record] = caplog.records
-    assert record.args == (1, 3, 4)   # jumps, poses used, poses tracked
+    assert record.args == (1, 3, 4)  # jumps, poses used, poses tracked
 
 
 def test_posecam_without_its_descriptions(tmp_path):
@@ -307,8 +382,10 @@ def test_axes_by_sensor_orientation(tmp_path, degrees):
     folder = made.make_posecam(tmp_path / 'in')
     replaced('device.json', '90', str(degrees))(folder)
     # About z, which looks away from the screen, x turns to y: clockwise in the image.
-    upright = Rotation.from_euler('z', degrees, degrees=True) * converted(
-        'android', folder, tmp_path / 'bag').axes
+    upright = (
+        Rotation.from_euler('z', degrees, degrees=True)
+        * converted('android', folder, tmp_path / 'bag').axes
+    )
     np.testing.assert_allclose(upright.as_matrix(), np.diag([1, -1, -1]), atol=1e-7)
 
 
@@ -316,7 +393,7 @@ def test_axes_by_sensor_orientation(tmp_path, degrees):
 def test_mars(tmp_path, clock, difference):
     folder = made.make_mars(tmp_path / 'in', clock, difference)
     read = converted('android', folder, tmp_path / 'bag')
-    assert read.stamps() == made.STAMPS   # on the IMU's clock
+    assert read.stamps() == made.STAMPS  # on the IMU's clock
     for number in range(len(made.STAMPS)):
         assert abs(np.median(read.pixels(number)) - made.brightness(number)) < 6
     samples = read.samples('/imu/data_raw')
@@ -344,6 +421,7 @@ def test_tables(tmp_path, as_video):
 
 # --- public data sets
 
+
 def check_delays(read: Converted, readout_ns: int) -> None:
     for topic, messages in read.messages.items():
         delay_ns = 2 * made.MILLISECOND if 'imu' in topic else readout_ns + 5 * made.MILLISECOND
@@ -363,8 +441,11 @@ def test_realsense_folder(tmp_path):
     folder = made.make_realsense(tmp_path / 'in')
     read = converted('realsense_rgb_rs', folder, tmp_path / 'bag')
     check_delays(read, 31_500_000)
-    check_images(read, [folder / 'images' / f'{stamp}.jpg' for stamp in made.REALSENSE_STAMPS],
-                 made.REALSENSE_STAMPS)
+    check_images(
+        read,
+        [folder / 'images' / f'{stamp}.jpg' for stamp in made.REALSENSE_STAMPS],
+        made.REALSENSE_STAMPS,
+    )
     lens = read.intrinsics
     assert (lens.width, lens.height) == (64, 48)
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (60.5, 61.5, 32.25, 24.75)
@@ -387,13 +468,17 @@ def test_xiaomi_folder(tmp_path):
     folder = made.make_xiaomi(tmp_path / 'in')
     read = converted('xiaomi_cc9_rs', folder, tmp_path / 'bag')
     check_delays(read, 31_100_000)
-    check_images(read, [folder / 'images' / f'RE_frame-{number}.jpg' for number in (2, 3)],
-                 [4_328_040_459_559_000, 4_328_040_492_872_000])
+    check_images(
+        read,
+        [folder / 'images' / f'RE_frame-{number}.jpg' for number in (2, 3)],
+        [4_328_040_459_559_000, 4_328_040_492_872_000],
+    )
     lens = read.intrinsics
     assert (lens.width, lens.height, lens.fx, lens.cy) == (800, 600, 573.8534, 309.0112)
     samples = read.samples('/imu/data_raw')
     assert [sample.stamp_ns for sample in samples] == [
-        4_328_040 * made.SECOND + k * made.SECOND // 4 for k in range(14)]
+        4_328_040 * made.SECOND + k * made.SECOND // 4 for k in range(14)
+    ]
     assert all(sample.linear_acceleration is None for sample in samples)
     assert samples[3].angular_velocity == (3e-3, -0.2, 0.3)
     message = read.of('/imu/data_raw')[0]
@@ -402,10 +487,16 @@ def test_xiaomi_folder(tmp_path):
 
 def test_data_sets_need_the_laboratory(tmp_path, monkeypatch):
     found = importlib.util.find_spec
-    monkeypatch.setattr('importlib.util.find_spec', lambda name: (
-        None if name == 'rs_relpose_lab' else found(name)))
-    refused('xiaomi_cc9_rs', made.make_xiaomi(tmp_path / 'in'), tmp_path / 'bag',
-            'need the package rs_relpose_lab', kind=MissingInputError)
+    monkeypatch.setattr(
+        'importlib.util.find_spec', lambda name: None if name == 'rs_relpose_lab' else found(name)
+    )
+    refused(
+        'xiaomi_cc9_rs',
+        made.make_xiaomi(tmp_path / 'in'),
+        tmp_path / 'bag',
+        'need the package rs_relpose_lab',
+        kind=MissingInputError,
+    )
 
 
 def test_decimal_stamps_keep_every_nanosecond(tmp_path):
@@ -413,11 +504,14 @@ def test_decimal_stamps_keep_every_nanosecond(tmp_path):
     (tmp_path / 'a.txt').write_text('# s\n\n1700000000.123456789\n 1.700000000156789012e9\n')
     rows = list(read_rows(tmp_path / 'a.txt', range(1)))
     assert [row.seconds_as_nanoseconds(0) for row in rows] == [
-        1_700_000_000_123_456_789, 1_700_000_000_156_789_012]
+        1_700_000_000_123_456_789,
+        1_700_000_000_156_789_012,
+    ]
     assert [row.line for row in rows] == [3, 4]
 
 
 # --- what cannot be used
+
 
 def portrait(name: str):
     return lambda folder: made.write_video(folder / name, made.VIDEO_TICKS, width=48, height=64)
@@ -433,35 +527,50 @@ MAKE = {'sleeping': lambda folder: made.make_mars(folder, 'UNKNOWN', 5_000_000)}
 MISSING = [
     ('posecam', removed('imu.csv'), 'is of no known logger'),
     ('posecam', removed(f'frames/000003_{made.STAMPS[3]}.jpg'), 'is missing'),
-    ('posecam', written('imu.csv', b'timestamp_ns,sensor,x,y,z\n1,accel,0,0,0\n'),
-     'no samples of a gyro'),
+    (
+        'posecam',
+        written('imu.csv', b'timestamp_ns,sensor,x,y,z\n1,accel,0,0,0\n'),
+        'no samples of a gyro',
+    ),
     ('tables', written('gyro.csv', b'stamp_ns,x,y,z\n'), 'has no rows'),
     ('realsense', removed('camera.txt'), 'camera.txt is missing'),
     ('realsense', removed(FIRST), '.jpg is missing'),
     ('realsense', written('imu.txt', b'# nothing\n'), 'at least one image and one IMU'),
     ('xiaomi', removed('framestamp.txt'), 'framestamp.txt is missing'),
-    ('xiaomi', lambda folder: (folder / 'images').rename(folder / 'pictures'),
-     'folder of images is missing'),
+    (
+        'xiaomi',
+        lambda folder: (folder / 'images').rename(folder / 'pictures'),
+        'folder of images is missing',
+    ),
     ('xiaomi', no_images, 'no images RE_frame-N.jpg'),
 ]
 INVALID = [
     ('posecam', replaced('poses.csv', ',image', ',picture'), 'has no column image'),
-    ('posecam', replaced('poses.csv', '0.2,0.3,0,0,0,1', '0.2,0.3,0,0,0,2'),
-     'quaternion must have length 1'),
+    (
+        'posecam',
+        replaced('poses.csv', '0.2,0.3,0,0,0,1', '0.2,0.3,0,0,0,2'),
+        'quaternion must have length 1',
+    ),
     ('posecam', replaced('imu.csv', 'gyro_uncal', 'magnet'), "got 'magnet'"),
     ('posecam', replaced('imu.csv', '0.25', 'nan'), 'line 3: column y must be a finite number'),
     ('posecam', replaced('intrinsics.json', '50.5', 'null'), 'must have the numbers fx'),
     ('posecam', replaced('intrinsics.json', '"width": 64', '"width": 24'), 'were rotated'),
     ('mars', replaced('frame_timestamps.txt', f'{made.STAMPS[2]},', '#'), 'has 4 stamps, but'),
     ('mars', portrait('movie.mp4'), 'were rotated'),
-    ('mars', replaced('frame_timestamps.txt', str(made.STAMPS[1]), str(made.STAMPS[0])),
-     'not after'),
+    (
+        'mars',
+        replaced('frame_timestamps.txt', str(made.STAMPS[1]), str(made.STAMPS[0])),
+        'not after',
+    ),
     ('sleeping', replaced('edge_epochs.txt', '\t5000000\n', '\t9000000\n'), 'the phone slept'),
     ('sleeping', replaced('edge_epochs.txt', '\t5000000\n', '\t5e6\n'), 'must be an integer'),
     ('tables', replaced('frames.csv', '3.jpg', '../3.jpg'), 'lies outside'),
     ('tables', replaced('frames.csv', ',file', ',name'), 'has 0 videos'),
-    ('tables', written('3.jpg', made.picture(3, 32, 48)),
-     'has 32x48 pixels, but the first image has 64x48'),
+    (
+        'tables',
+        written('3.jpg', made.picture(3, 32, 48)),
+        'has 32x48 pixels, but the first image has 64x48',
+    ),
     ('realsense', written('camera.txt', b'60 60 32 24\n64 48\n'), 'must begin with'),
     ('realsense', replaced('camera.txt', ' 0\n', ' 0.9\n'), 'distortion 0.9'),
     ('realsense', replaced('camera.txt', '64 48', '640 480'), '64x48 pixels, but'),
@@ -474,8 +583,10 @@ INVALID = [
 ]
 
 
-@pytest.mark.parametrize('name, damage, words, kind', [
-    *((*row, MissingInputError) for row in MISSING), *((*row, InputError) for row in INVALID)])
+@pytest.mark.parametrize(
+    'name, damage, words, kind',
+    [*((*row, MissingInputError) for row in MISSING), *((*row, InputError) for row in INVALID)],
+)
 def test_damaged_folder(tmp_path, name, damage, words, kind):
     folder = (MAKE.get(name) or getattr(made, f'make_{name}'))(tmp_path / 'in')
     damage(folder)
@@ -483,10 +594,15 @@ def test_damaged_folder(tmp_path, name, damage, words, kind):
     refused(source, folder, tmp_path / 'bag', words, kind=kind)
 
 
-@pytest.mark.parametrize('read, texts', [
-    (Row.real, ('nan', 'inf', 'x', '', None, 7)), (Row.integer, ('5e6', '1.0', '')),
-    (Row.nanoseconds, ('1.65e18', '-1', '9' * 19, '9' * 30)),
-    (Row.seconds_as_nanoseconds, ('soon', 'nan', '-4.3', '1e60', '1e999999999'))])
+@pytest.mark.parametrize(
+    'read, texts',
+    [
+        (Row.real, ('nan', 'inf', 'x', '', None, 7)),
+        (Row.integer, ('5e6', '1.0', '')),
+        (Row.nanoseconds, ('1.65e18', '-1', '9' * 19, '9' * 30)),
+        (Row.seconds_as_nanoseconds, ('soon', 'nan', '-4.3', '1e60', '1e999999999')),
+    ],
+)
 def test_values_that_are_refused(read, texts):
     for text in texts:
         with pytest.raises(InputError, match=r'^a\.csv, line 7: column c must be a'):
@@ -498,17 +614,27 @@ def test_paths_that_cannot_be_used(tmp_path, refused):
     refused('there is no folder', 'convert', 'xiaomi_cc9_rs', tmp_path / 'no', tmp_path / 'bag')
     for occupied in ('bag', 'bag.yaml'):
         (tmp_path / occupied).write_text('mine')
-        refused(f'{tmp_path / occupied} exists already', 'convert', 'xiaomi_cc9_rs', folder,
-                tmp_path / 'bag')
+        refused(
+            f'{tmp_path / occupied} exists already',
+            'convert',
+            'xiaomi_cc9_rs',
+            folder,
+            tmp_path / 'bag',
+        )
         assert (tmp_path / occupied).read_text() == 'mine'
         (tmp_path / occupied).unlink()
 
 
 # --- parameter files of the data sets
 
-@pytest.mark.parametrize(('dataset', 'axes', 'degrees'), [
-    ('realsense_rgb_rs', Rotation.identity(), pytest.approx(1.0, abs=1.0)),
-    ('xiaomi_cc9_rs', PHONE_AXES, pytest.approx(1.57, abs=0.01))])
+
+@pytest.mark.parametrize(
+    ('dataset', 'axes', 'degrees'),
+    [
+        ('realsense_rgb_rs', Rotation.identity(), pytest.approx(1.0, abs=1.0)),
+        ('xiaomi_cc9_rs', PHONE_AXES, pytest.approx(1.57, abs=0.01)),
+    ],
+)
 def test_parameter_file_is_that_of_the_command(tmp_path, dataset, axes, degrees):
     """With axes within some degrees of those of its device."""
     file, (title, values) = ROOT / 'config' / f'{dataset}.yaml', datasets.packaged(dataset)
@@ -526,15 +652,23 @@ def test_parameter_file_is_that_of_the_command(tmp_path, dataset, axes, degrees)
 
 # --- recordings
 
+
 @pytest.mark.recordings
 def test_xiaomi_recording(recordings, tmp_path):
     folder = recordings / 'xiaomi_cc9_rs'
     read = converted('xiaomi_cc9_rs', folder, tmp_path / 'bag')
     # Stamps as in the phone's own log, whose clock counts microseconds.
-    starts = {int(number): 1000 * int(microseconds) for microseconds, number in re.findall(
-        r'^SOF +(\d+), +frameNum :(\d+)', (folder / 'gyro_dump.txt').read_text(), re.MULTILINE)}
-    check_images(read, [folder / 'images' / f'RE_frame-{k}.jpg' for k in range(99, 202)],
-                 [starts[k] for k in range(99, 202)])
+    starts = {
+        int(number): 1000 * int(microseconds)
+        for microseconds, number in re.findall(
+            r'^SOF +(\d+), +frameNum :(\d+)', (folder / 'gyro_dump.txt').read_text(), re.MULTILINE
+        )
+    }
+    check_images(
+        read,
+        [folder / 'images' / f'RE_frame-{k}.jpg' for k in range(99, 202)],
+        [starts[k] for k in range(99, 202)],
+    )
     assert max(np.diff(read.stamps('/imu/data_raw'))) < 3 * made.MILLISECOND
 
 
@@ -547,7 +681,7 @@ def rotates_as_its_images(read: Converted) -> None:
     for number in range(len(read.of(IMAGES))):
         pixels = read.pixels(number)
         assert pixels.shape == (480, 854)
-        far = pixels[:235].astype(float)   # above the horizon
+        far = pixels[:235].astype(float)  # above the horizon
         if before is not None:
             shifts.append(cv2.phaseCorrelate(before, far)[0][0])
         before = far
@@ -561,7 +695,8 @@ def rotates_as_its_images(read: Converted) -> None:
 def test_gopro(recordings, tmp_path):
     read = converted('video', recordings / 'gopro_samples' / 'karma.mp4', tmp_path / 'bag')
     assert [stamp - START_NS for stamp in read.stamps()] == [
-        round(k * 1001 / 30000 * 1e9) for k in range(362)]
+        round(k * 1001 / 30000 * 1e9) for k in range(362)
+    ]
     rotates_as_its_images(read)
     gyro, accel = read.stamps('/imu/gyro'), read.stamps('/imu/accel')
     assert len(gyro) == 4795 and len(accel) == 2397
@@ -578,5 +713,9 @@ def test_gopro(recordings, tmp_path):
 
 @pytest.mark.recordings
 def test_gopro_that_levelled_its_horizon(recordings, tmp_path):
-    refused('video', recordings / 'gopro_samples' / 'max-heromode.mp4', tmp_path / 'bag',
-            "stabilised in the camera (GoPro's EISE is Y)")
+    refused(
+        'video',
+        recordings / 'gopro_samples' / 'max-heromode.mp4',
+        tmp_path / 'bag',
+        "stabilised in the camera (GoPro's EISE is Y)",
+    )

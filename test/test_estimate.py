@@ -21,8 +21,9 @@ from rs_relpose_ros.estimator.result import landmarks, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import tangent_basis
 
-CONFIG = EstimatorConfig(gravity_sigma=np.radians(0.2), gyro_sigma=np.radians(0.1),
-                         pixel_sigma=0.5)
+CONFIG = EstimatorConfig(
+    gravity_sigma=np.radians(0.2), gyro_sigma=np.radians(0.1), pixel_sigma=0.5
+)
 EXACT = EstimatorConfig(pixel_sigma=0.01, gravity_sigma=1e-5, gyro_sigma=1e-6)
 NO_NOISE = {'pixel_noise': 0.0, 'gravity_noise': 0.0, 'gyro_noise': 0.0}
 
@@ -33,7 +34,7 @@ def estimate(scene, config=CONFIG, **arguments):
 
 def rotation_nees(pose, R, covariance):
     """NEES by degrees of freedom: 1 on average, 0.79 in the median if the covariance holds."""
-    return sigmas(pose.R, R, covariance)**2 / 3
+    return sigmas(pose.R, R, covariance) ** 2 / 3
 
 
 def sigmas(R, truth, covariance):
@@ -45,8 +46,9 @@ def test_a_pair_without_consensus_has_few_samples():
     """Matches at random with the gyro's rotation; without it, each solver has all samples."""
     scene, rng = make_scene(5, outliers=0.0), np.random.default_rng(5)
     scene = replace(scene, points2=rng.permutation(scene.points2))
-    aided = estimate(scene, relative_rotation=scene.R,
-                     relative_rotation_covariance=1e-6 * np.eye(3))
+    aided = estimate(
+        scene, relative_rotation=scene.R, relative_rotation_covariance=1e-6 * np.eye(3)
+    )
     alone = estimate(scene)
     assert aided.status is alone.status is Status.NO_CONSENSUS
     limit = CONFIG.max_iterations
@@ -55,16 +57,20 @@ def test_a_pair_without_consensus_has_few_samples():
 
 # Limits: twice the prototype's medians (design, section 4); the 5-point on derotated rays has
 # 0.071 deg and 2.5 deg in the first, 1.4 and 34 in the second.
-@pytest.mark.parametrize(('cell', 'rotation', 'translation'), [
-    ({}, 0.044, 0.54),
-    ({'speed': 10.0}, 0.048, 0.8),
-    ({'direction': 'sideways'}, 0.068, 1.7),
-    ({'speed': 0.0, 'rate': 0.0}, 0.034, 0.36),
-    ({'outliers': 0.6}, 0.07, 1.0),
-    ({'gravity_noise': np.radians(1.0)}, 0.06, 0.8),
-    ({'constant_velocity': True}, 0.044, 0.54),
-    (None, 0.05, 0.8),
-], ids=str)
+@pytest.mark.parametrize(
+    ('cell', 'rotation', 'translation'),
+    [
+        ({}, 0.044, 0.54),
+        ({'speed': 10.0}, 0.048, 0.8),
+        ({'direction': 'sideways'}, 0.068, 1.7),
+        ({'speed': 0.0, 'rate': 0.0}, 0.034, 0.36),
+        ({'outliers': 0.6}, 0.07, 1.0),
+        ({'gravity_noise': np.radians(1.0)}, 0.06, 0.8),
+        ({'constant_velocity': True}, 0.044, 0.54),
+        (None, 0.05, 0.8),
+    ],
+    ids=str,
+)
 def test_accuracy(cell, rotation, translation):
     """Medians over 8 scenes; the last case is without gravity. Outliers are found."""
     errors, found = [], []
@@ -73,8 +79,9 @@ def test_accuracy(cell, rotation, translation):
         pose = estimate(scene, gravity=cell is not None)
         assert pose, pose.reason
         errors.append((rotation_error(pose.R, scene.R), direction_error(pose.t, scene.t)))
-        found.append((pose.inliers[scene.is_outlier].mean(),
-                      pose.inliers[~scene.is_outlier].mean()))
+        found.append(
+            (pose.inliers[scene.is_outlier].mean(), pose.inliers[~scene.is_outlier].mean())
+        )
     assert (np.median(errors, axis=0) <= (rotation, translation)).all()
     accepted, kept = np.median(found, axis=0)
     assert accepted < 0.03 and kept > 0.9
@@ -91,8 +98,11 @@ def test_equivalent_global_shutter_pixels_are_epipolar():
         """Median distance from the epipolar line ``f_1 . (t x R f_2) = 0`` [px]."""
         rays1, rays2 = (VIEW.unproject(points[pose.inliers]) for points in (points1, points2))
         lines = np.cross(scene.t, rays2 @ scene.R.T)
-        return np.median(np.abs((rays1 * lines).sum(axis=1)) * SENSOR.camera.fx
-                         / np.linalg.norm(lines[:, :2], axis=1))
+        return np.median(
+            np.abs((rays1 * lines).sum(axis=1))
+            * SENSOR.camera.fx
+            / np.linalg.norm(lines[:, :2], axis=1)
+        )
 
     equivalent = distance(pose.pixels1_gs, pose.pixels2_gs)
     assert equivalent < 0.01
@@ -121,8 +131,9 @@ def test_normalised_errors_are_chi_square():
         assert pose.t @ pose.covariance[:3, :3] @ pose.t < 1e-12
         assert np.linalg.eigvalsh(pose.covariance).min() > -1e-15
         basis = np.linalg.svd(pose.t[None])[2][1:]
-        error = np.concatenate([basis @ scene.t,
-                                Rotation.from_matrix(scene.R @ pose.R.T).as_rotvec()])
+        error = np.concatenate(
+            [basis @ scene.t, Rotation.from_matrix(scene.R @ pose.R.T).as_rotvec()]
+        )
         project = np.zeros((5, 6))
         project[:2, :3], project[2:, 3:] = basis, np.eye(3)
         values.append(error @ np.linalg.solve(project @ pose.covariance @ project.T, error))
@@ -137,8 +148,9 @@ def test_covariance_holds_where_neighbours_share_their_errors():
     """
     values = []
     for seed in range(40):
-        scene = make_scene(seed, outliers=0.0, pixel_noise=0.3, gravity_noise=0.0,
-                           reference='middle')
+        scene = make_scene(
+            seed, outliers=0.0, pixel_noise=0.3, gravity_noise=0.0, reference='middle'
+        )
         column, row = (scene.points1 // 320.0).astype(int).T
         shared = 0.6 * np.random.default_rng([seed, 1]).normal(size=(9, 6, 2))
         scene = replace(scene, points2=scene.points2 + shared[column, row])
@@ -152,8 +164,12 @@ def test_covariance_holds_where_neighbours_share_their_errors():
 def gyro_prior(scene, error=(0.0, 0.0, 0.0), sigma=2e-4, **config):
     """The pose with the gyro's rotation, which has an `error` [rad]."""
     rotation = Rotation.from_rotvec(error).as_matrix() @ scene.R
-    return estimate(scene, replace(CONFIG, **config), relative_rotation=rotation,
-                    relative_rotation_covariance=sigma**2 * np.eye(3))
+    return estimate(
+        scene,
+        replace(CONFIG, **config),
+        relative_rotation=rotation,
+        relative_rotation_covariance=sigma**2 * np.eye(3),
+    )
 
 
 def test_a_gyro_that_disagrees_with_the_images_widens_the_covariance():
@@ -172,7 +188,7 @@ def test_a_gyro_that_contradicts_the_images_has_no_pose(seed):
     assert gyro_prior(scene, (0.0, 6e-4, 0.0))
     wrong = gyro_prior(scene, (0.0, 0.02, 0.0))
     assert wrong.status is Status.NO_CONSENSUS and np.isnan(wrong.R).all()
-    assert wrong.rejected.inliers.mean() > 0.8   # a wrong translation fits most matches
+    assert wrong.rejected.inliers.mean() > 0.8  # a wrong translation fits most matches
     apart = float(re.search(r'rotation ([.\d]+) deg', wrong.reason)[1])
     assert apart == pytest.approx(1.1, abs=0.2)
     assert gyro_prior(scene, (0.0, 0.02, 0.0), sigma=0.02)
@@ -181,16 +197,28 @@ def test_a_gyro_that_contradicts_the_images_has_no_pose(seed):
 @pytest.mark.parametrize(('share', 'status'), [(0.5, 'LOW_PARALLAX'), (0.7, 'OK')])
 def test_a_direction_whose_sign_the_depths_do_not_determine(share, status):
     """Matches on exact epipolar lines, a share of them in front of the cameras."""
-    rng, camera = np.random.default_rng(0), RollingShutterCamera(
-        width=1280, height=720, fx=600.0, fy=600.0, cx=639.5, cy=359.5, readout_time=0.03)
+    rng, camera = (
+        np.random.default_rng(0),
+        RollingShutterCamera(
+            width=1280, height=720, fx=600.0, fy=600.0, cx=639.5, cy=359.5, readout_time=0.03
+        ),
+    )
     R, t = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), np.array([0.8, 0.1, 0.6])
     points = rng.uniform([-4, -2, 8], [4, 2, 20], (300, 3))
     sign = np.where(rng.uniform(size=300) < share, 1.0, -1.0)[:, None]
-    pixels = [camera.project(rays) + rng.normal(0.0, 0.2, (300, 2))
-              for rays in (points, (points - sign * t) @ R)]
+    pixels = [
+        camera.project(rays) + rng.normal(0.0, 0.2, (300, 2))
+        for rays in (points, (points - sign * t) @ R)
+    ]
     still = FrameMotion(np.zeros(3))
-    pose = estimate_relative_pose(*pixels, camera, still, still, relative_rotation=R,
-                                  relative_rotation_covariance=1e-8 * np.eye(3))
+    pose = estimate_relative_pose(
+        *pixels,
+        camera,
+        still,
+        still,
+        relative_rotation=R,
+        relative_rotation_covariance=1e-8 * np.eye(3),
+    )
     assert pose.status is Status[status]
     assert rotation_error(pose.R, R) < 0.02
     assert abs(pose.inliers.sum() - 300 * share) < 20
@@ -220,11 +248,15 @@ def test_equal_state_gives_equal_bits_another_seed_or_solver_nearly_the_same():
         assert rotation_error(a.R, other.R) < 0.02, solver
 
 
-@pytest.mark.parametrize(('solver', 'noise', 'motion', 'limits'), [
-    ('angular_5pt', 0.5, {'speed': 0.0, 'outliers': 0.3}, (0.1, 1.0, 0.0)),
-    ('uniform_9pt', 0.01, {'speed': 10.0}, (0.004, 0.1, 0.2)),
-    ('uniform_9pt', 0.01, {'speed': 10.0, 'direction': 'sideways'}, (0.004, 0.1, 0.2)),
-], ids=str)
+@pytest.mark.parametrize(
+    ('solver', 'noise', 'motion', 'limits'),
+    [
+        ('angular_5pt', 0.5, {'speed': 0.0, 'outliers': 0.3}, (0.1, 1.0, 0.0)),
+        ('uniform_9pt', 0.01, {'speed': 10.0}, (0.004, 0.1, 0.2)),
+        ('uniform_9pt', 0.01, {'speed': 10.0, 'direction': 'sideways'}, (0.004, 0.1, 0.2)),
+    ],
+    ids=str,
+)
 def test_alternating_refinement(solver, noise, motion, limits):
     """R, t [deg], v1: medians over 8 scenes; two thirds of those of the best hypothesis."""
     config = replace(CONFIG, solver=solver, pixel_sigma=noise)
@@ -234,8 +266,13 @@ def test_alternating_refinement(solver, noise, motion, limits):
         for seed in range(8):
             scene = make_scene(seed, **NO_NOISE | {'outliers': 0.0, 'pixel_noise': noise} | motion)
             pose = estimate(scene, replace(config, refinement=refinement))
-            errors.append((rotation_error(pose.R, scene.R), direction_error(pose.t, scene.t),
-                           np.linalg.norm(pose.linear_velocity1 - scene.v1)))
+            errors.append(
+                (
+                    rotation_error(pose.R, scene.R),
+                    direction_error(pose.t, scene.t),
+                    np.linalg.norm(pose.linear_velocity1 - scene.v1),
+                )
+            )
         medians.append(np.median(errors, axis=0))
     hypothesis, refined = medians
     assert (refined <= 0.67 * hypothesis).all()
@@ -253,8 +290,9 @@ def test_pure_rotation_has_a_rotation_and_no_translation():
         sigma = np.degrees(np.sqrt(np.trace(pose.covariance[3:, 3:])))
         assert rotation_error(pose.R, scene.R) < 4.0 * sigma
         # The rates are the gyro's.
-        np.testing.assert_array_equal(pose.velocity_covariance[3:, 3:],
-                                      CONFIG.gyro_sigma**2 * np.eye(3))
+        np.testing.assert_array_equal(
+            pose.velocity_covariance[3:, 3:], CONFIG.gyro_sigma**2 * np.eye(3)
+        )
 
 
 def test_a_direction_that_is_too_uncertain_is_no_pose():
@@ -267,42 +305,67 @@ def test_a_direction_that_is_too_uncertain_is_no_pose():
     assert f'{sigma:.3g} deg' in rest.reason
     # The rotation is that of the pose; nothing of the translation is left.
     assert rest.rotation_known
-    for values in (lambda p: p.R, lambda p: p.covariance[3:, 3:], lambda p: p.inliers,
-                   lambda p: p.velocity_covariance[3:, 3:]):
+    for values in (
+        lambda p: p.R,
+        lambda p: p.covariance[3:, 3:],
+        lambda p: p.inliers,
+        lambda p: p.velocity_covariance[3:, 3:],
+    ):
         np.testing.assert_array_equal(values(rest), values(pose))
-    for unknown in (rest.t, rest.linear_velocity1, rest.linear_velocity2, rest.covariance[:3],
-                    rest.covariance[:, :3], rest.velocity_covariance[:3]):
+    for unknown in (
+        rest.t,
+        rest.linear_velocity1,
+        rest.linear_velocity2,
+        rest.covariance[:3],
+        rest.covariance[:, :3],
+        rest.velocity_covariance[:3],
+    ):
         assert np.isnan(unknown).all()
     # And of the inverse.
     back = rest.inverse()
     np.testing.assert_allclose(back.R, pose.R.T)
-    np.testing.assert_allclose(back.covariance[3:, 3:], pose.inverse().covariance[3:, 3:],
-                               rtol=1e-9)
+    np.testing.assert_allclose(
+        back.covariance[3:, 3:], pose.inverse().covariance[3:, 3:], rtol=1e-9
+    )
 
 
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'points1': np.zeros((20, 3))}, '^points1 must have shape'),
-    ({'points2': np.full((20, 2), np.nan)}, '^points2 must be finite'),
-    ({'points1': np.full((20, 2), 1e9)}, '^points1 '),
-    ({'points1': np.zeros((19, 2))}, '^points2 '),
-    ({'relative_rotation': np.eye(3)}, 'go together'),
-    ({'relative_rotation': 2 * np.eye(3), 'relative_rotation_covariance': np.eye(3)},
-     '^relative_rotation must be'),
-    ({'relative_rotation': np.eye(3), 'relative_rotation_covariance': -np.eye(3)},
-     '^relative_rotation_covariance must be'),
-    ({'interval': -1.0}, '^interval must be'),
-    ({'quality': np.zeros(3)}, '^quality '),
-    ({'config': EstimatorConfig(solver='uniform_9pt')}, '^solver '),
-])
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'points1': np.zeros((20, 3))}, '^points1 must have shape'),
+        ({'points2': np.full((20, 2), np.nan)}, '^points2 must be finite'),
+        ({'points1': np.full((20, 2), 1e9)}, '^points1 '),
+        ({'points1': np.zeros((19, 2))}, '^points2 '),
+        ({'relative_rotation': np.eye(3)}, 'go together'),
+        (
+            {'relative_rotation': 2 * np.eye(3), 'relative_rotation_covariance': np.eye(3)},
+            '^relative_rotation must be',
+        ),
+        (
+            {'relative_rotation': np.eye(3), 'relative_rotation_covariance': -np.eye(3)},
+            '^relative_rotation_covariance must be',
+        ),
+        ({'interval': -1.0}, '^interval must be'),
+        ({'quality': np.zeros(3)}, '^quality '),
+        ({'config': EstimatorConfig(solver='uniform_9pt')}, '^solver '),
+    ],
+)
 def test_bad_arguments_are_refused_by_name(change, message):
     still = FrameMotion(np.zeros(3))
-    arguments = {'points1': np.zeros((20, 2)), 'points2': np.zeros((20, 2)),
-                 'camera': CAMERA, 'motion1': still, 'motion2': still, **change}
+    arguments = {
+        'points1': np.zeros((20, 2)),
+        'points2': np.zeros((20, 2)),
+        'camera': CAMERA,
+        'motion1': still,
+        'motion2': still,
+        **change,
+    }
     with pytest.raises(InputError, match=message):
         estimate_relative_pose(**arguments)
 
 
 # -- Information of the images alone -----------------------------------------------------------
+
 
 def by_images(pose):
     """Rotation of the least cost of the images, and its covariance."""
@@ -316,8 +379,10 @@ def test_the_gyro_between_the_frames_has_no_part_in_it():
     sigma, moved, moved_images = 3e-4, [], []
     for seed in range(1, 9):
         scene = make_scene(seed, constant_velocity=True)
-        poses = [gyro_prior(scene, error, sigma)
-                 for error in ((0.0, 0.0, 0.0), (0.0, 3.0 * sigma, 3.0 * sigma))]
+        poses = [
+            gyro_prior(scene, error, sigma)
+            for error in ((0.0, 0.0, 0.0), (0.0, 3.0 * sigma, 3.0 * sigma))
+        ]
         (R1, covariance), (R2, _) = map(by_images, poses)
         moved.append(sigmas(poses[0].images.R, poses[1].images.R, covariance))
         moved_images.append(sigmas(R1, R2, covariance))
@@ -356,24 +421,34 @@ def scenes():
 def test_baseline_and_direction(scenes):
     poses = [scene.pose(between=()) for scene in scenes]
     assert all(poses)
-    errors = np.array([np.log(pose.baseline / scene.baseline)
-                       for pose, scene in zip(poses, scenes, strict=True)])
+    errors = np.array(
+        [np.log(pose.baseline / scene.baseline) for pose, scene in zip(poses, scenes, strict=True)]
+    )
     sigmas = np.array([pose.baseline_log_sigma for pose in poses])
     known = np.isfinite(errors)
     assert known.sum() >= 8
     assert np.median(np.abs(errors[known])) < 0.15
     assert (sigmas[known] > 0.0).all() and (sigmas[known] < 1.0).all()
     assert np.mean((errors / sigmas)[known] ** 2) < 2.5
-    speeds = [np.linalg.norm(pose.metric_velocity1 - scene.motion.velocity)
-              for pose, scene in zip(poses, scenes, strict=True)]
-    assert np.nanmedian(speeds) < 0.25   # of 1 m/s
+    speeds = [
+        np.linalg.norm(pose.metric_velocity1 - scene.motion.velocity)
+        for pose, scene in zip(poses, scenes, strict=True)
+    ]
+    assert np.nanmedian(speeds) < 0.25  # of 1 m/s
     # The accelerometer determines the velocities, which the images do not.
     metric, timed, neither = (
-        np.median([direction_error(pose.t, scene.t)
-                   for pose, scene in zip(of_scenes, scenes, strict=True)])
-        for of_scenes in (poses, [scene.pose(between=(), inertial=None) for scene in scenes],
-                          [scene.pose(between=(), inertial=None, interval=None)
-                           for scene in scenes]))
+        np.median(
+            [
+                direction_error(pose.t, scene.t)
+                for pose, scene in zip(of_scenes, scenes, strict=True)
+            ]
+        )
+        for of_scenes in (
+            poses,
+            [scene.pose(between=(), inertial=None) for scene in scenes],
+            [scene.pose(between=(), inertial=None, interval=None) for scene in scenes],
+        )
+    )
     assert metric < 0.95 * timed < 0.7 * neither
 
 
@@ -393,13 +468,21 @@ def test_interval_duration_inverse_and_lever_arm_of_a_baseline(scenes):
     scene, inertial = scenes[1], scenes[1].arguments['inertial']
     pose = scene.pose(between=())
     assert (pose.inverse().baseline, pose.inverse().baseline_log_sigma) == (
-        pose.baseline, pose.baseline_log_sigma)
+        pose.baseline,
+        pose.baseline_log_sigma,
+    )
     assert scene.pose(between=(), interval=None).baseline == pose.baseline
-    without_gyro = {'between': (), 'interval': None, 'relative_rotation': None,
-                    'relative_rotation_covariance': None}
-    for changes, message in (({'interval': 0.21}, r'^interval must equal'),
-                             ({'interval': 0.0, 'inertial': None}, 'interval must be'),
-                             (without_gyro, r'^inertial with a lever_arm')):
+    without_gyro = {
+        'between': (),
+        'interval': None,
+        'relative_rotation': None,
+        'relative_rotation_covariance': None,
+    }
+    for changes, message in (
+        ({'interval': 0.21}, r'^interval must equal'),
+        ({'interval': 0.0, 'inertial': None}, 'interval must be'),
+        (without_gyro, r'^inertial with a lever_arm'),
+    ):
         with pytest.raises(InputError, match=message):
             scene.pose(**{'between': ()} | changes)
     free = InertialMotion(inertial.alpha, inertial.beta, INTERVAL, inertial.covariance)
@@ -408,8 +491,20 @@ def test_interval_duration_inverse_and_lever_arm_of_a_baseline(scenes):
 
 def evidence(scene, pose, inertial):
     given, nothing = scene.arguments, np.empty((0, 2))
-    problem = build_problem(nothing, nothing, *(given[name] for name in (
-        'camera', 'motion1', 'motion2', 'relative_rotation', 'relative_rotation_covariance')))
+    problem = build_problem(
+        nothing,
+        nothing,
+        *(
+            given[name]
+            for name in (
+                'camera',
+                'motion1',
+                'motion2',
+                'relative_rotation',
+                'relative_rotation_covariance',
+            )
+        ),
+    )
     measured, _ = velocity.expected_velocities(problem, 'hand_held', INTERVAL, inertial)
     return velocity.inertial_evidence(problem, pose.images, 'hand_held', INTERVAL, measured)
 
@@ -423,12 +518,23 @@ def test_images_distinguish_the_acceleration_from_another_one(scenes, with_accel
         configured = scene.arguments['inertial']
         pose = scene.pose(between=(), inertial=configured if with_accelerometer else None)
         if with_accelerometer:
-            assert pose.inertial_evidence == pytest.approx(evidence(scene, pose, configured),
-                                                           abs=1e-6)
+            assert pose.inertial_evidence == pytest.approx(
+                evidence(scene, pose, configured), abs=1e-6
+            )
         for found, map_ in ((right, np.eye(3)), (permuted, axes)):
-            found.append(evidence(scene, pose, replace(configured, **{
-                name: map_ @ np.asarray(getattr(configured, name))
-                for name in ('alpha', 'beta', 'acceleration1', 'acceleration2')})))
+            found.append(
+                evidence(
+                    scene,
+                    pose,
+                    replace(
+                        configured,
+                        **{
+                            name: map_ @ np.asarray(getattr(configured, name))
+                            for name in ('alpha', 'beta', 'acceleration1', 'acceleration2')
+                        },
+                    ),
+                )
+            )
     configured, opposite = np.sum(right, axis=0)
     assert configured > 10.0 and opposite < -10.0
     assert np.sum(permuted, axis=0)[0] < -10.0
@@ -447,8 +553,10 @@ def test_evidence_by_the_density_of_the_acceleration():
 
     def both(a, V):
         prior = VelocityPrior(c, a, np.linalg.inv(V), 0.0, 0.0, 1.0, 0.0)
-        return (velocity._log_evidence(H, g, t, velocities, prior, np.array([np.log(b)])),
-                multivariate_normal(mean, covariance + V).logpdf(-a))
+        return (
+            velocity._log_evidence(H, g, t, velocities, prior, np.array([np.log(b)])),
+            multivariate_normal(mean, covariance + V).logpdf(-a),
+        )
 
     first, second = both(rng.normal(size=6), 0.3 * np.eye(6)), both(np.zeros(6), 2.0 * np.eye(6))
     assert first[0] - second[0] == pytest.approx(first[1] - second[1], abs=1e-9)
@@ -456,11 +564,13 @@ def test_evidence_by_the_density_of_the_acceleration():
 
 # -- Landmarks and equivalent global-shutter pixels ---------------------------------------------
 
+
 @pytest.mark.parametrize('seed', range(3))
 def test_exact_matches_give_the_truth(seed):
     flight = simulated_flight(seed)
-    for pair, truth, baseline in zip(flight.pairs, flight.true_landmarks, flight.baselines,
-                                     strict=True):
+    for pair, truth, baseline in zip(
+        flight.pairs, flight.true_landmarks, flight.baselines, strict=True
+    ):
         found = pair.landmarks
         np.testing.assert_allclose(found.points * baseline, truth.points, rtol=1e-8)
         np.testing.assert_allclose(found.pixels1, truth.pixels1, atol=1e-7)
@@ -488,6 +598,7 @@ def test_parallel_rays_have_no_point_and_outliers_have_nothing():
 
 # -- Refinement: Sampson error, its Jacobian and depths, priors of the joint fit -------------
 
+
 def random_observations(rng, n=50):
     """Observation rows that obey no model: every term of the Jacobian is exercised."""
     rows = rng.normal(size=(n, 20)) * 0.3
@@ -502,16 +613,24 @@ def random_state(rng, rate=0.0):
     """`rate` [rad/s]: of the gyro's corrections."""
     t, d1, d2, dw1, dw2 = rng.normal(size=(5, 3))
     return TwoViewState(
-        Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix(), t / np.linalg.norm(t),
-        2.0 * d1, 2.0 * d2, rate * dw1, rate * dw2)
+        Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix(),
+        t / np.linalg.norm(t),
+        2.0 * d1,
+        2.0 * d2,
+        rate * dw1,
+        rate * dw2,
+    )
 
 
 def stepped(state, step):
     """As `priors.moved`, by SciPy."""
     R, t, *rest = state
     t = t + tangent_basis(t) @ step[3:5]
-    return TwoViewState(Rotation.from_rotvec(step[:3]).as_matrix() @ R, t / np.linalg.norm(t),
-                        *(v + step[k:k + 3] for v, k in zip(rest, (5, 8, 11, 14), strict=True)))
+    return TwoViewState(
+        Rotation.from_rotvec(step[:3]).as_matrix() @ R,
+        t / np.linalg.norm(t),
+        *(v + step[k : k + 3] for v, k in zip(rest, (5, 8, 11, 14), strict=True)),
+    )
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -523,8 +642,10 @@ def test_jacobian_equals_finite_differences(seed):
     for k in range(PARAMETERS):
         unit = np.zeros(PARAMETERS)
         unit[k] = step
-        numeric = (sampson.residuals(rows, stepped(state, unit))
-                   - sampson.residuals(rows, stepped(state, -unit))) / (2 * step)
+        numeric = (
+            sampson.residuals(rows, stepped(state, unit))
+            - sampson.residuals(rows, stepped(state, -unit))
+        ) / (2 * step)
         np.testing.assert_allclose(exact[:, k], numeric, atol=1e-6 * np.abs(numeric).max())
 
 
@@ -541,13 +662,15 @@ def test_residual_is_the_constraint_over_its_gradient_by_pixels():
     gradient = np.empty((len(rows), 4))
     for k, (ray, derivative) in enumerate(((0, 3), (0, 6), (9, 12), (9, 15))):
         ahead, back = rows.copy(), rows.copy()
-        ahead[:, ray:ray + 3] += rows[:, derivative:derivative + 3]
-        back[:, ray:ray + 3] -= rows[:, derivative:derivative + 3]
+        ahead[:, ray : ray + 3] += rows[:, derivative : derivative + 3]
+        back[:, ray : ray + 3] -= rows[:, derivative : derivative + 3]
         # Exact: the constraint is linear in either ray.
         gradient[:, k] = (constraint(ahead, state) - constraint(back, state)) / 2.0
     np.testing.assert_allclose(
         sampson.residuals(rows, state),
-        constraint(rows, state) / np.linalg.norm(gradient, axis=1), rtol=1e-10)
+        constraint(rows, state) / np.linalg.norm(gradient, axis=1),
+        rtol=1e-10,
+    )
 
 
 def test_depths_of_exact_matches():
@@ -578,18 +701,40 @@ def priors_near(rng, state, **weights):
     near = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
     root = np.sqrt(weights.get('velocity', 0.0)) * rng.normal(size=(6, 6))
     velocity = priors.VelocityPrior(
-        rate=2.0, offset=rng.normal(size=6), information=root @ root.T, log_scale=0.4,
-        centre=-0.3, weight=weights.get('scale', 0.0), freedom=1.7)
-    values = {'gravity_weight': 0.0, 'gravity_row_time': 0.03, 'rate_weight': 0.0, **{
-        k: v for k, v in weights.items() if k not in ('rotation', 'velocity', 'scale')}}
-    return Priors(np.array([0.59, 0.02, 0.81]), down, rotation=near @ state.R,
-                  rotation_information=np.diag([3.0, 4.0, 5.0]) * weights.get('rotation', 0.0),
-                  velocity=velocity, **values)
+        rate=2.0,
+        offset=rng.normal(size=6),
+        information=root @ root.T,
+        log_scale=0.4,
+        centre=-0.3,
+        weight=weights.get('scale', 0.0),
+        freedom=1.7,
+    )
+    values = {
+        'gravity_weight': 0.0,
+        'gravity_row_time': 0.03,
+        'rate_weight': 0.0,
+        **{k: v for k, v in weights.items() if k not in ('rotation', 'velocity', 'scale')},
+    }
+    return Priors(
+        np.array([0.59, 0.02, 0.81]),
+        down,
+        rotation=near @ state.R,
+        rotation_information=np.diag([3.0, 4.0, 5.0]) * weights.get('rotation', 0.0),
+        velocity=velocity,
+        **values,
+    )
 
 
-@pytest.mark.parametrize('weights', [{'gravity_weight': 7.0}, {'rate_weight': 3.0},
-                                     {'velocity': 2.0}, {'velocity': 2.0, 'scale': 3.0},
-                                     {'rotation': 1.0}])
+@pytest.mark.parametrize(
+    'weights',
+    [
+        {'gravity_weight': 7.0},
+        {'rate_weight': 3.0},
+        {'velocity': 2.0},
+        {'velocity': 2.0, 'scale': 3.0},
+        {'rotation': 1.0},
+    ],
+)
 def test_gradient_of_each_prior(weights):
     rng = np.random.default_rng(1)
     # Gravity's derivative by the rates neglects their products: exact about zero.
@@ -606,15 +751,18 @@ def test_gradient_of_each_prior(weights):
     def cost_after(change):
         velocity = prior.velocity
         scale = velocity.log_scale + (change[SCALE] if n > SCALE else 0.0)
-        return priors.prior_cost(priors.moved(state, change), priors.at_scale(
-            prior, scale, velocity.centre, velocity.freedom))
+        return priors.prior_cost(
+            priors.moved(state, change),
+            priors.at_scale(prior, scale, velocity.centre, velocity.freedom),
+        )
 
     for k in range(n):
         ahead, behind = (cost_after(sign * step * np.eye(n)[k]) for sign in (1.0, -1.0))
         # Half the gradient of a sum of squares. Log has a Jacobian that the fit takes for one.
         tolerance = 0.03 if 'rotation' in weights else 1e-6
         assert (ahead - behind) / (4 * step) == pytest.approx(
-            gradient[k], abs=tolerance * (1.0 + np.abs(gradient).max())), k
+            gradient[k], abs=tolerance * (1.0 + np.abs(gradient).max())
+        ), k
 
 
 def test_gravity_holds_at_the_reference_row_for_any_gyro():
@@ -622,8 +770,9 @@ def test_gravity_holds_at_the_reference_row_for_any_gyro():
     config = EstimatorConfig(pixel_sigma=0.01, gravity_sigma=1e-5, gyro_sigma=np.radians(3.0))
     errors = []
     for seed in range(5):
-        scene = make_scene(seed, pixel_noise=0.0, gravity_noise=0.0, gyro_noise=np.radians(3.0),
-                           outliers=0.0)
+        scene = make_scene(
+            seed, pixel_noise=0.0, gravity_noise=0.0, gyro_noise=np.radians(3.0), outliers=0.0
+        )
         pose = estimate_scene(scene, config)
         assert pose
         errors.append(rotation_error(pose.R, scene.R))

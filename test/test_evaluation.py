@@ -36,8 +36,12 @@ def test_auto_is_as_good_as_five_points_on_derotated_rays_at_constant_velocity()
     """The linear velocities cannot be observed then, and must not cost what five points know."""
     errors = {}
     for trial in range(12):
-        problem = paper_problem(replace(EXACT, speed=5.0, pixel_noise=0.5, outliers=0.3,
-                                        constant_velocity=True), 'forward', 0, trial)
+        problem = paper_problem(
+            replace(EXACT, speed=5.0, pixel_noise=0.5, outliers=0.3, constant_velocity=True),
+            'forward',
+            0,
+            trial,
+        )
         for method in ('auto', 'opencv_derotated'):
             _, error = run_method(method, problem, trial)
             errors.setdefault(method, []).append((error.rotation, error.translation))
@@ -54,7 +58,8 @@ def test_exact_data_beat_the_papers_claim(method, direction):
     sweep = SWEEPS['linear_velocity']
     for trial, level in enumerate(sweep.levels):
         status, error = run_method(
-            method, paper_problem(sweep.cell(level, EXACT), direction, 0, trial), trial)
+            method, paper_problem(sweep.cell(level, EXACT), direction, 0, trial), trial
+        )
         assert status is Status.OK
         assert error.rotation < 0.001
 
@@ -62,29 +67,53 @@ def test_exact_data_beat_the_papers_claim(method, direction):
 def test_command_writes_tables_pictures_and_its_arguments(tmp_path, capsys):
     folder = tmp_path / 'deep' / 'results'
     trials, cells = evaluate(
-        folder, 'paper', '--trials', '2', '--figures', 'gyro_noise', '--motions', 'forward',
-        'sideways', 'forward', '--solvers', 'auto', 'angular_5pt', '--pixel-noise', '0.3')
+        folder,
+        'paper',
+        '--trials',
+        '2',
+        '--figures',
+        'gyro_noise',
+        '--motions',
+        'forward',
+        'sideways',
+        'forward',
+        '--solvers',
+        'auto',
+        'angular_5pt',
+        '--pixel-noise',
+        '0.3',
+    )
     shown = capsys.readouterr()
-    assert shown.err == ''      # no progress bar in a pipe
+    assert shown.err == ''  # no progress bar in a pipe
     for motion in ('forward', 'sideways'):
         assert shown.out.count(f'{motion} motion, 2 scenes a row') == 1
     assert len(trials) == 2 * 6 * 2 * 2
     for cell in cells:
-        mine = [float(row['rotation_error_deg']) for row in trials
-                if all(row[key] == cell[key] for key in ('experiment', 'case', 'level', 'method'))]
+        mine = [
+            float(row['rotation_error_deg'])
+            for row in trials
+            if all(row[key] == cell[key] for key in ('experiment', 'case', 'level', 'method'))
+        ]
         assert len(mine) == int(cell['poses']) == 2
         assert float(cell['rotation_median_deg']) == pytest.approx(np.median(mine))
         assert float(cell['rotation_max_deg']) == max(mine)
     arguments = json.loads((folder / 'run.json').read_text())
     assert arguments['trials'] == 2 and arguments['base']['pixel_noise'] == 0.3
-    assert cv2.imread(str(folder / 'gyro_noise.png')).shape[0] > 600   # two motions
+    assert cv2.imread(str(folder / 'gyro_noise.png')).shape[0] > 600  # two motions
 
 
 # The published parameters of the GoPro C2, as in OCamCalib (Matlab): row before column, both
 # counted from 1.
-C2 = {'ss': [-877.468361, 0.0, 3.33880820e-04, -9.24194160e-09, 1.10410236e-11],
-      'xc': 539.90501924, 'yc': 959.85847286, 'c': 1.00430175, 'd': -0.00044732,
-      'e': -0.00137768, 'width': 1920, 'height': 1080}
+C2 = {
+    'ss': [-877.468361, 0.0, 3.33880820e-04, -9.24194160e-09, 1.10410236e-11],
+    'xc': 539.90501924,
+    'yc': 959.85847286,
+    'c': 1.00430175,
+    'd': -0.00044732,
+    'e': -0.00137768,
+    'width': 1920,
+    'height': 1080,
+}
 
 
 @pytest.fixture(scope='module')
@@ -96,13 +125,18 @@ def made(tmp_path_factory):
     # Two seconds of a walk, looking ahead: optical frame in a world with z up.
     seconds = np.arange(62) / 30.0
     ahead = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    angles = np.column_stack([0.3 * np.sin(3.0 * seconds), 0.05 * np.sin(5.0 * seconds),
-                              0.04 * np.cos(4.0 * seconds)])
-    positions = np.column_stack([1.3 * seconds, 0.1 * np.sin(4.0 * seconds),
-                                 1.6 + 0.03 * np.sin(8.0 * seconds)])
+    angles = np.column_stack(
+        [0.3 * np.sin(3.0 * seconds), 0.05 * np.sin(5.0 * seconds), 0.04 * np.cos(4.0 * seconds)]
+    )
+    positions = np.column_stack(
+        [1.3 * seconds, 0.1 * np.sin(4.0 * seconds), 1.6 + 0.03 * np.sin(8.0 * seconds)]
+    )
     R = (Rotation.from_euler('ZYX', angles) * ahead).as_matrix()
-    np.savetxt(folder / 'data/ground_truth/as/pose.txt', np.column_stack(
-        [0.026 + seconds, np.dstack([R, positions]).reshape(-1, 12)]), fmt='%.9f')
+    np.savetxt(
+        folder / 'data/ground_truth/as/pose.txt',
+        np.column_stack([0.026 + seconds, np.dstack([R, positions]).reshape(-1, 12)]),
+        fmt='%.9f',
+    )
     cells = np.empty((1, 7), dtype=object)
     cells[0, :] = [C2] * 7
     savemat(folder / 'tools/intrinsic_calibration/cc.mat', {'cc': cells})
@@ -111,24 +145,48 @@ def made(tmp_path_factory):
 
 def test_command_runs_on_the_made_folder(made, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(penncosyvio.STRETCHES, 'as', ((2, 32),))
-    trials, cells = evaluate(tmp_path, 'penncosyvio', made, '--sequences', 'as', '--solvers',
-                             'auto', 'opencv_gyro', '--trajectory-only')
+    trials, cells = evaluate(
+        tmp_path,
+        'penncosyvio',
+        made,
+        '--sequences',
+        'as',
+        '--solvers',
+        'auto',
+        'opencv_gyro',
+        '--trajectory-only',
+    )
     assert 'simulated points' in capsys.readouterr().out
     assert {file.name for file in tmp_path.iterdir()} == {
-        'trials.csv', 'cells.csv', 'run.json', f'{penncosyvio.EXPERIMENT}.png'}
+        'trials.csv',
+        'cells.csv',
+        'run.json',
+        f'{penncosyvio.EXPERIMENT}.png',
+    }
     assert [(row['method'], row['trial'], row['status']) for row in trials] == [
-        ('auto', '2', 'OK'), ('opencv_gyro', '2', 'OK')]
+        ('auto', '2', 'OK'),
+        ('opencv_gyro', '2', 'OK'),
+    ]
     assert [row['level'] for row in cells] == ['1', '1', 'all', 'all']
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['paper', '--trials', '0'], 'trials must be at least 1, got 0'),
-    (['penncosyvio', 'nowhere'], 'nowhere'),
-    (['penncosyvio', 'MADE', '--readout-time', '2'], 'readout_time must be in [0, 1) s'),
-    (['penncosyvio', 'MADE', '--sequences', 'af'], 'pose.txt')])
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['paper', '--trials', '0'], 'trials must be at least 1, got 0'),
+        (['penncosyvio', 'nowhere'], 'nowhere'),
+        (['penncosyvio', 'MADE', '--readout-time', '2'], 'readout_time must be in [0, 1) s'),
+        (['penncosyvio', 'MADE', '--sequences', 'af'], 'pose.txt'),
+    ],
+)
 def test_bad_input_is_refused(made, tmp_path, arguments, message, refused):
-    refused(message, 'evaluate', *(made if word == 'MADE' else word for word in arguments),
-            '--output', tmp_path / 'out')
+    refused(
+        message,
+        'evaluate',
+        *(made if word == 'MADE' else word for word in arguments),
+        '--output',
+        tmp_path / 'out',
+    )
     assert not (tmp_path / 'out').exists()
 
 
@@ -142,20 +200,32 @@ CENTRE = np.array([problems.CENTRE_U, problems.CENTRE_V])
 @pytest.mark.parametrize('module', [oracle, problems, rows])
 def test_independent_of_the_package(module):
     tree = ast.parse(Path(module.__file__).read_text(encoding='utf-8'))
-    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
-                for alias in node.names}
+    imported = {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert {name for name in imported if name.startswith('rs_relpose')} <= {
-        'rs_relpose_lab.experiments.problems', 'rs_relpose_lab.simulation.rows'}
+        'rs_relpose_lab.experiments.problems',
+        'rs_relpose_lab.simulation.rows',
+    }
 
 
 def constant(w, v):
     return uniform_motion(Rotation.identity(), np.zeros(3), np.array(w), np.array(v))
 
 
-@pytest.mark.parametrize(('w', 'v', 'reference_row'), [
-    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0), ([3.0, -3.0, 3.0], [0.0, 0.0, 0.0], 0.0),
-    ([1.0, 1.0, -1.0], [10.0, -10.0, 10.0], 0.0), ([-3.0, 3.0, 1.0], [10.0, 10.0, 10.0], 539.5)])
+@pytest.mark.parametrize(
+    ('w', 'v', 'reference_row'),
+    [
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),
+        ([3.0, -3.0, 3.0], [0.0, 0.0, 0.0], 0.0),
+        ([1.0, 1.0, -1.0], [10.0, -10.0, 10.0], 0.0),
+        ([-3.0, 3.0, 1.0], [10.0, 10.0, 10.0], 539.5),
+    ],
+)
 def test_a_point_is_in_the_row_that_a_scan_of_all_rows_finds(w, v, reference_row):
     rng = np.random.default_rng(1)
     world = rng.uniform([-12.0, -8.0, 6.0], [12.0, 8.0, 34.0], (60, 3))
@@ -205,7 +275,7 @@ def test_points_of_the_brute_force_camera_fulfil_the_constraint(cell):
     objective = objective_of(problem)
     residuals = objective.residuals(objective.truth()[:, None])[:, 0]
     # First those of the matches; those of the priors follow.
-    assert np.abs(SIGMAS[0] * residuals[:len(problem.points1)]).max() < 1e-6
+    assert np.abs(SIGMAS[0] * residuals[: len(problem.points1)]).max() < 1e-6
     # Gravity in both frames is one direction of the world.
     assert problem.R @ problem.measured_gravity2 == pytest.approx(problem.measured_gravity1)
 

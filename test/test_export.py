@@ -39,8 +39,10 @@ LAST_NS = round(READOUT_NS * 479 / 480)
 @pytest.fixture(scope='module')
 def trajectory(bundled_bag, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp('odometry') / 'results'
-    assert command_line(['odometry', str(bundled_bag), *PARAMS, '--rate', '50', '--out',
-                         str(folder)]) == 0
+    assert (
+        command_line(['odometry', str(bundled_bag), *PARAMS, '--rate', '50', '--out', str(folder)])
+        == 0
+    )
     return folder
 
 
@@ -52,6 +54,7 @@ def rows(trajectory) -> RowTrajectory:
 @pytest.fixture
 def run(bundled_bag, trajectory, rows, tmp_path):
     """Export the bundled bag; exit code and folder. `changes`: of the rows."""
+
     def export_it(*options: str, tracks: Tracks | None = None, **changes: Any) -> tuple[int, Path]:
         out, given = tmp_path / 'model', trajectory
         if tracks or changes:
@@ -59,8 +62,10 @@ def run(bundled_bag, trajectory, rows, tmp_path):
             export.replace(rows, **changes).save(given / 'trajectory_rows.npz')
         if tracks:
             tracks.save(given / 'tracks.npz')
-        return command_line(['export', str(bundled_bag), str(out), *PARAMS, '--trajectory',
-                             str(given), *options]), out
+        return command_line(
+            ['export', str(bundled_bag), str(out), *PARAMS, '--trajectory', str(given), *options]
+        ), out
+
     return export_it
 
 
@@ -69,9 +74,12 @@ def messages(bundled_bag):
     """Images of the bag by stamp."""
     with open_bag(bundled_bag) as bag:
         topics = bag.find_topics({})
-        return {one.message.header.stamp.sec * 10**9 + one.message.header.stamp.nanosec:
-                bytes(one.message.data) for _, one in sensor_messages(
-                    bag, topics, (Role.IMAGE,))}
+        return {
+            one.message.header.stamp.sec * 10**9 + one.message.header.stamp.nanosec: bytes(
+                one.message.data
+            )
+            for _, one in sensor_messages(bag, topics, (Role.IMAGE,))
+        }
 
 
 def report_of(out: Path) -> dict:
@@ -88,10 +96,13 @@ def test_poses_of_rows_are_as_good_as_those_of_keyframes(bundled_bag, rows, mess
         R, p = rows.pose(times)
         true = np.array([truth.position(time) for time in times])
         turn, way, _ = aligned(p, true)
-        error = np.sqrt(((p @ turn.T + way - true)**2).sum(axis=1).mean())
-        turned = [Rotation.from_matrix(
-            R[k + 10].T @ R[k] @ truth.rotation(times[k]).T @ truth.rotation(times[k + 10])
-            ).magnitude() for k in range(len(times) - 10)]
+        error = np.sqrt(((p @ turn.T + way - true) ** 2).sum(axis=1).mean())
+        turned = [
+            Rotation.from_matrix(
+                R[k + 10].T @ R[k] @ truth.rotation(times[k]).T @ truth.rotation(times[k + 10])
+            ).magnitude()
+            for k in range(len(times) - 10)
+        ]
         return error, np.degrees(np.sqrt(np.mean(np.square(turned))))
 
     at_keyframes, _ = compared(rows.keyframes_ns[:, 1])
@@ -120,8 +131,23 @@ def test_a_tum_file_at_any_rate(bundled_bag, rows, trajectory, tmp_path):
     np.testing.assert_allclose(lines[:, 1:4], p, atol=1e-8)
     np.testing.assert_allclose(Rotation.from_quat(lines[:, 4:]).as_matrix(), R, atol=1e-8)
     out = tmp_path / 'path.tum'
-    assert command_line(['export', str(bundled_bag), str(out), '--format', 'tum', '--trajectory',
-                         str(trajectory), *PARAMS, '--rate', '50']) == 0
+    assert (
+        command_line(
+            [
+                'export',
+                str(bundled_bag),
+                str(out),
+                '--format',
+                'tum',
+                '--trajectory',
+                str(trajectory),
+                *PARAMS,
+                '--rate',
+                '50',
+            ]
+        )
+        == 0
+    )
     assert out.read_bytes() == (trajectory / 'trajectory_rows.tum').read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ['path.tum']
 
@@ -133,7 +159,8 @@ def test_raw_images_are_those_of_the_bag(run, messages, capsys):
     names = value['names'].tolist()
     assert sorted(path.name for path in (out / 'images').iterdir()) == names
     assert {int(name[:-4]): (out / 'images' / name).read_bytes() for name in names} == {
-        int(name[:-4]): messages[int(name[:-4])] for name in names}
+        int(name[:-4]): messages[int(name[:-4])] for name in names
+    }
     # Each frame is exported, or left out with its reason.
     lost = {one['stamp_ns'] for one in report['left_out']}
     assert lost and lost.isdisjoint({int(name[:-4]) for name in names})
@@ -154,20 +181,24 @@ def test_gray_values_of_points_are_those_of_the_images(run):
     code, out = run('--format', 'colmap', '--images', 'raw')
     assert code == 0
     folder = out / 'sparse' / '0'
-    images = [line.split() for line in (folder / 'images.txt').read_text().splitlines()
-              if line[0] != '#']
-    colors = {row[0]: int(row[4]) for row in (
-        line.split() for line in (folder / 'points3D.txt').read_text().splitlines())
-        if row[0] != '#'}
+    images = [
+        line.split() for line in (folder / 'images.txt').read_text().splitlines() if line[0] != '#'
+    ]
+    colors = {
+        row[0]: int(row[4])
+        for row in (line.split() for line in (folder / 'points3D.txt').read_text().splitlines())
+        if row[0] != '#'
+    }
     shown: dict[str, list[int]] = {}
     for head, observed in zip(images[::2], images[1::2], strict=True):
         image = cv2.imread(str(out / 'images' / head[9]), cv2.IMREAD_GRAYSCALE)
         for x, y, point in np.reshape(observed, (-1, 3)):
             shown.setdefault(point, []).append(int(image[int(float(y)), int(float(x))]))
-    agree = [min(abs(value - colors[point]) for value in values) <= 2
-             for point, values in shown.items()]
+    agree = [
+        min(abs(value - colors[point]) for value in values) <= 2 for point, values in shown.items()
+    ]
     assert len(agree) > 300
-    assert np.mean(agree) > 0.95   # rounding at the edge of a pixel
+    assert np.mean(agree) > 0.95  # rounding at the edge of a pixel
 
 
 def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
@@ -176,8 +207,10 @@ def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
     bag = tmp_path / 'unrolled'
     assert command_line(['unroll', str(bundled_bag), str(bag), *PARAMS]) == 0
     with open_bag(bag) as opened:
-        unrolled = [bytes(one.message.data) for _, one in sensor_messages(
-            opened, opened.find_topics({}), (Role.IMAGE,))]
+        unrolled = [
+            bytes(one.message.data)
+            for _, one in sensor_messages(opened, opened.find_topics({}), (Role.IMAGE,))
+        ]
     files = {path.name: path.read_bytes() for path in (out / 'images').iterdir()}
     order = sorted(messages)
     assert all(unrolled[order.index(int(name[:-4]))] == data for name, data in files.items())
@@ -185,7 +218,7 @@ def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
     # The translation within the readout is what one pose costs.
     assert 0.1 < report['formula_px']['median'] < 1.0
     raw_code, _ = run('--format', 'colmap', '--images', 'raw', '--points', '50')
-    assert raw_code == 2   # it exists
+    assert raw_code == 2  # it exists
     shutil.rmtree(out)
     assert run('--format', 'colmap', '--images', 'raw', '--points', '50')[0] == 0
     raw = report_of(out)
@@ -196,8 +229,9 @@ def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
 def test_images_at_a_rate(run):
     code, out = run('--format', 'nerfstudio', '--rate', '6', '--images', 'none')
     assert code == 0
-    names = [frame['file_path'] for frame in json.loads(
-        (out / 'transforms.json').read_text())['frames']]
+    names = [
+        frame['file_path'] for frame in json.loads((out / 'transforms.json').read_text())['frames']
+    ]
     stamps = np.array([int(Path(name).stem) for name in names])
     steps = np.diff(stamps) * 1e-9
     assert steps.min() > 0.15
@@ -216,22 +250,40 @@ def test_raw_images_are_kept_once_and_linked(run, trajectory, tmp_path):
 
 def test_the_odometry_is_run_if_it_is_not_given(bundled_bag, rows, tmp_path):
     out = tmp_path / 'model'
-    assert command_line(['export', str(bundled_bag), str(out), *PARAMS, '--format', 'gsplat',
-                         '--images', 'none']) == 0
-    np.testing.assert_array_equal(RowTrajectory.load(
-        out / 'odometry' / 'trajectory_rows.npz').positions, rows.positions)
+    assert (
+        command_line(
+            [
+                'export',
+                str(bundled_bag),
+                str(out),
+                *PARAMS,
+                '--format',
+                'gsplat',
+                '--images',
+                'none',
+            ]
+        )
+        == 0
+    )
+    np.testing.assert_array_equal(
+        RowTrajectory.load(out / 'odometry' / 'trajectory_rows.npz').positions, rows.positions
+    )
     assert [path.name for path in tmp_path.iterdir()] == ['model']
 
 
 # -- faults ------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(('options', 'words'), [
-    (('--format', 'tum', '--images', 'raw'), '--format tum has no images'),
-    (('--format', 'colmap', '--link', '--trajectory', '.'), '--link is for raw images'),
-    (('--format', 'gsplat', '--link'), '--link needs --trajectory'),
-    (('--format', 'gsplat', '--points', '-1'), '--points must be at least 0'),
-    (('--format', 'gsplat', '--trajectory', 'none'), 'does not exist: `rs_relpose odometry`'),
-])
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        (('--format', 'tum', '--images', 'raw'), '--format tum has no images'),
+        (('--format', 'colmap', '--link', '--trajectory', '.'), '--link is for raw images'),
+        (('--format', 'gsplat', '--link'), '--link needs --trajectory'),
+        (('--format', 'gsplat', '--points', '-1'), '--points must be at least 0'),
+        (('--format', 'gsplat', '--trajectory', 'none'), 'does not exist: `rs_relpose odometry`'),
+    ],
+)
 def test_bad_options(options, words, bundled_bag, tmp_path, refused):
     refused(words, 'export', bundled_bag, tmp_path / 'model', *PARAMS, *options)
     assert list(tmp_path.iterdir()) == []
@@ -249,13 +301,19 @@ def test_an_existing_folder_stays_as_it_is(run, tmp_path):
     assert [path.name for path in (tmp_path / 'model').iterdir()] == ['mine']
 
 
-@pytest.mark.parametrize(('options', 'owner', 'name', 'code', 'words'), [
-    ((), Path, 'write_bytes', 1, 'No space left on device'),
-    (('--link',), os, 'link', 2, 'cannot be linked')])
-def test_an_error_of_the_file_system_leaves_nothing(options, owner, name, code, words, run,
-                                                    tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ('options', 'owner', 'name', 'code', 'words'),
+    [
+        ((), Path, 'write_bytes', 1, 'No space left on device'),
+        (('--link',), os, 'link', 2, 'cannot be linked'),
+    ],
+)
+def test_an_error_of_the_file_system_leaves_nothing(
+    options, owner, name, code, words, run, tmp_path, monkeypatch, capsys
+):
     def fail(first, second):
         raise OSError(28, 'No space left on device')
+
     monkeypatch.setattr(owner, name, fail)
     assert run('--format', 'gsplat', *options)[0] == code
     assert words in capsys.readouterr().err
@@ -264,8 +322,13 @@ def test_an_error_of_the_file_system_leaves_nothing(options, owner, name, code, 
 
 def test_a_trajectory_of_another_recording(run, rows, capsys):
     later = 10**12
-    code, out = run('--format', 'gsplat', spans=rows.spans + later,
-                    stamps_ns=rows.stamps_ns + later, keyframes_ns=rows.keyframes_ns + later)
+    code, out = run(
+        '--format',
+        'gsplat',
+        spans=rows.spans + later,
+        stamps_ns=rows.stamps_ns + later,
+        keyframes_ns=rows.keyframes_ns + later,
+    )
     assert code == 2
     assert 'Is the trajectory that of this bag?' in capsys.readouterr().err
     assert not out.exists()
@@ -275,18 +338,24 @@ def test_without_an_accelerometer_nothing_is_written(bundled_bag, tmp_path, caps
     def without(message):
         if hasattr(message, 'linear_acceleration'):
             message.linear_acceleration_covariance = np.array([-1.0] + [0.0] * 8)
+
     bag = tmp_path / 'bag'
     copied(bundled_bag, bag, without)
-    assert command_line(['export', str(bag), str(tmp_path / 'model'), *PARAMS, '--format',
-                         'gsplat']) == 1
+    assert (
+        command_line(['export', str(bag), str(tmp_path / 'model'), *PARAMS, '--format', 'gsplat'])
+        == 1
+    )
     assert 'odometry did not start: there is no accelerometer' in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ['bag']
 
 
 def test_frames_in_a_gap_are_left_out_and_listed(run, rows, caplog):
     gap = rows.spans[0, 0] + np.array([2, 3]) * 10**9
-    code, out = run('--format', 'gsplat', spans=np.array(
-        [[rows.spans[0, 0], gap[0]], [gap[1], rows.spans[0, 1]]]))
+    code, out = run(
+        '--format',
+        'gsplat',
+        spans=np.array([[rows.spans[0, 0], gap[0]], [gap[1], rows.spans[0, 1]]]),
+    )
     assert code == 0
     report = report_of(out)
     assert report['trajectory_gaps_ns'] == [gap.tolist()]
@@ -307,10 +376,19 @@ def test_without_landmarks_images_are_exported(run, capsys):
 
 def test_landmarks_are_gated(rows):
     """Wrong observations do not count, and tracks that slide are left out."""
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                                  readout_time=0.03)
-    intrinsics = Intrinsics(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                            image_width=640, image_height=480)
+    camera = RollingShutterCamera(
+        width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5, readout_time=0.03
+    )
+    intrinsics = Intrinsics(
+        width=640,
+        height=480,
+        fx=450.0,
+        fy=450.0,
+        cx=319.5,
+        cy=239.5,
+        image_width=640,
+        image_height=480,
+    )
     times = rows.keyframes_ns[4:10, 1]
     R, p = rows.pose(times)
     rng = np.random.default_rng(1)
@@ -318,11 +396,12 @@ def test_landmarks_are_gated(rows):
     world = p[3] + 4.0 * ray @ R[3].T
     pixels = np.array([camera.project((world - p[k]) @ R[k]) for k in range(6)])
     pixels += 0.2 * rng.standard_normal(pixels.shape)
-    pixels[4, :10] += 30.0   # a wrong match
-    pixels[:, 10:20] += 15.0 * rng.standard_normal((6, 10, 2))   # no point at all
+    pixels[4, :10] += 30.0  # a wrong match
+    pixels[:, 10:20] += 15.0 * rng.standard_normal((6, 10, 2))  # no point at all
     ids = np.repeat(np.arange(40), 6)
-    tracks = Tracks(ids, np.tile(times, 40), np.tile(times, 40),
-                    pixels.transpose(1, 0, 2).reshape(-1, 2))
+    tracks = Tracks(
+        ids, np.tile(times, 40), np.tile(times, 40), pixels.transpose(1, 0, 2).reshape(-1, 2)
+    )
     found = triangulated(tracks, rows, Sensor(camera, intrinsics, ImageClock(camera)), 100)
     counts = np.bincount(found.observations.ids, minlength=40)
     assert (counts[:10] == 5).all()

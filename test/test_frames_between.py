@@ -15,13 +15,19 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 
 CAMERA = RollingShutterCamera(
-    width=640, height=480, fx=450.0, fy=455.0, cx=322.0, cy=238.0, distortion=(-0.1, 0.02, 0.0,
-                                                                               0.0),
-    readout_time=0.03)
-TIMES = np.array([0.0, 0.07, 0.13, 0.2, 0.27])   # of the reference rows [s]
+    width=640,
+    height=480,
+    fx=450.0,
+    fy=455.0,
+    cx=322.0,
+    cy=238.0,
+    distortion=(-0.1, 0.02, 0.0, 0.0),
+    readout_time=0.03,
+)
+TIMES = np.array([0.0, 0.07, 0.13, 0.2, 0.27])  # of the reference rows [s]
 ARM = np.array([0.03, -0.01, 0.02])
-SIGMA = 0.3   # of a pixel's coordinates
-GYRO_WALK, BIAS_SIGMA = 5e-4, 2e-3   # [rad/sqrt(s)], [rad/s]
+SIGMA = 0.3  # of a pixel's coordinates
+GYRO_WALK, BIAS_SIGMA = 5e-4, 2e-3  # [rad/sqrt(s)], [rad/s]
 GRAVITY_ERROR = np.array([0.3, -0.5, 0.2])
 
 
@@ -35,9 +41,13 @@ class Motion:
 
     def R(self, s):
         s = np.asarray(s, dtype=float)[..., None]
-        return Rotation.from_rotvec(
-            (self.rate * s + 0.5 * self.angular_acceleration * s**2).reshape(-1, 3)
-        ).as_matrix().reshape(*s.shape[:-1], 3, 3)
+        return (
+            Rotation.from_rotvec(
+                (self.rate * s + 0.5 * self.angular_acceleration * s**2).reshape(-1, 3)
+            )
+            .as_matrix()
+            .reshape(*s.shape[:-1], 3, 3)
+        )
 
     def p(self, s):
         s = np.asarray(s, dtype=float)[..., None]
@@ -46,8 +56,9 @@ class Motion:
     def gyro(self, s):
         """Rate in the axes of the camera, by a central difference."""
         h = 1e-5
-        return Rotation.from_matrix(np.swapaxes(self.R(s - h), -1, -2) @ self.R(s + h)
-                                    ).as_rotvec() / (2.0 * h)
+        return Rotation.from_matrix(
+            np.swapaxes(self.R(s - h), -1, -2) @ self.R(s + h)
+        ).as_rotvec() / (2.0 * h)
 
     def frame(self, s):
         samples = np.linspace(-0.01, 0.04, 51)
@@ -65,10 +76,16 @@ class Motion:
 
         def acceleration(x):
             return (q(x + h) - 2.0 * q(x) + q(x - h)) / h**2 + gravity_error
+
         return InertialMotion(
             q(s) - q(0.0) - s * velocity(0.0) + 0.5 * s * s * gravity_error,
-            velocity(s) - velocity(0.0) + s * gravity_error, s,
-            np.diag([0.5 * s * s] * 3 + [s] * 3)**2, ARM, acceleration(0.0), acceleration(s))
+            velocity(s) - velocity(0.0) + s * gravity_error,
+            s,
+            np.diag([0.5 * s * s] * 3 + [s] * 3) ** 2,
+            ARM,
+            acceleration(0.0),
+            acceleration(s),
+        )
 
 
 class Scene:
@@ -84,31 +101,51 @@ class Scene:
         visible = ((pixels > 5.0) & (pixels < [635.0, 475.0])).all(axis=(0, 2))
         pixels = pixels[:, visible][:, :count] + rng.normal(0.0, sigma, (len(TIMES), count, 2))
         steps = np.diff(TIMES, prepend=0.0)
-        off = gyro * (np.cumsum(rng.normal(0.0, GYRO_WALK, (len(TIMES), 3))
-                                * np.sqrt(steps)[:, None], axis=0)
-                      + TIMES[:, None] * rng.normal(0.0, BIAS_SIGMA, 3))
-        rotations = [Rotation.from_rotvec(o).as_matrix().T @ motion.R(s)
-                     for o, s in zip(off, TIMES, strict=True)]
+        off = gyro * (
+            np.cumsum(
+                rng.normal(0.0, GYRO_WALK, (len(TIMES), 3)) * np.sqrt(steps)[:, None], axis=0
+            )
+            + TIMES[:, None] * rng.normal(0.0, BIAS_SIGMA, 3)
+        )
+        rotations = [
+            Rotation.from_rotvec(o).as_matrix().T @ motion.R(s)
+            for o, s in zip(off, TIMES, strict=True)
+        ]
         covariances = [(GYRO_WALK**2 * s + BIAS_SIGMA**2 * s * s) * np.eye(3) for s in TIMES]
         self.R, self.t = motion.R(ends), motion.p(ends) / np.linalg.norm(motion.p(ends))
         self.baseline = np.linalg.norm(motion.p(ends))
         error = gyro * GRAVITY_ERROR
-        self.between = [IntermediateFrame(
-            pixels[k], motion.frame(TIMES[k]), TIMES[k], rotations[k], covariances[k],
-            motion.inertial(TIMES[k], error)) for k in range(1, len(TIMES) - 1)]
+        self.between = [
+            IntermediateFrame(
+                pixels[k],
+                motion.frame(TIMES[k]),
+                TIMES[k],
+                rotations[k],
+                covariances[k],
+                motion.inertial(TIMES[k], error),
+            )
+            for k in range(1, len(TIMES) - 1)
+        ]
         self.arguments = {
-            'points1': pixels[0], 'points2': pixels[-1], 'camera': CAMERA,
-            'motion1': motion.frame(0.0), 'motion2': motion.frame(ends),
-            'relative_rotation': rotations[-1], 'relative_rotation_covariance': covariances[-1],
-            'interval': ends, 'inertial': motion.inertial(ends, error)}
+            'points1': pixels[0],
+            'points2': pixels[-1],
+            'camera': CAMERA,
+            'motion1': motion.frame(0.0),
+            'motion2': motion.frame(ends),
+            'relative_rotation': rotations[-1],
+            'relative_rotation_covariance': covariances[-1],
+            'interval': ends,
+            'inertial': motion.inertial(ends, error),
+        }
 
     def observe(self, points, s):
         """Pixels (N, 2): each row sees the camera at its own time."""
         row = np.full(len(points), 240.0)
         for _ in range(12):
             at = s + CAMERA.row_times(row)
-            seen = CAMERA.project(np.einsum('nji,nj->ni', self.motion.R(at),
-                                            points - self.motion.p(at)))
+            seen = CAMERA.project(
+                np.einsum('nji,nj->ni', self.motion.R(at), points - self.motion.p(at))
+            )
             row = seen[:, 1]
         return seen
 
@@ -136,6 +173,7 @@ def fitted(scene, monkeypatch):
     def record(*arguments):
         calls.append((arguments, adjust(*arguments)))
         return calls[-1][1]
+
     monkeypatch.setattr(frames_between.adjustment, 'adjust', record)
     pose = scene.pose()
     arguments, adjusted = calls[-1]
@@ -152,16 +190,26 @@ def test_exact_data_give_the_true_pose():
     assert abs(log_baseline) < 0.01
     ends = TIMES[-1]
     for velocity, at in ((pose.linear_velocity1, 0.0), (pose.linear_velocity2, ends)):
-        true = scene.motion.R(at).T @ (scene.motion.p(at + 1e-5) - scene.motion.p(at - 1e-5)) / (
-            2e-5 * scene.baseline)
+        true = (
+            scene.motion.R(at).T
+            @ (scene.motion.p(at + 1e-5) - scene.motion.p(at - 1e-5))
+            / (2e-5 * scene.baseline)
+        )
         np.testing.assert_allclose(velocity, true, atol=0.02)
 
 
 def test_all_frames_beat_two_views():
     scenes = [Scene(seed) for seed in range(20, 32)]
-    errors = np.array([[np.linalg.norm(scene.error(scene.pose(between=between))[0][part])
-                        for between in ((), scene.between) for part in (slice(3), slice(3, 6))]
-                       for scene in scenes])
+    errors = np.array(
+        [
+            [
+                np.linalg.norm(scene.error(scene.pose(between=between))[0][part])
+                for between in ((), scene.between)
+                for part in (slice(3), slice(3, 6))
+            ]
+            for scene in scenes
+        ]
+    )
     two_t, two_R, all_t, all_R = np.median(errors, axis=0)
     assert all_t < 0.7 * two_t and all_R < two_R
 
@@ -180,8 +228,9 @@ def test_covariance_is_that_of_the_errors():
         start = scene.motion.p(1e-5) - scene.motion.p(-1e-5)
         across = np.linalg.svd(pose.linear_velocity1[None])[2][1:]
         off = across @ start / np.linalg.norm(start) * np.linalg.norm(pose.linear_velocity1)
-        starts.append(off @ np.linalg.solve(
-            across @ pose.linear_velocity1_covariance @ across.T, off) / 2.0)
+        starts.append(
+            off @ np.linalg.solve(across @ pose.linear_velocity1_covariance @ across.T, off) / 2.0
+        )
         by_gyro.append(pose.gyro_square / 3.0)
     # Mean of 40 chi-squares of 5 degrees of freedom, by freedom: 1 +- 0.1.
     assert 0.7 < np.mean(chi2) < 1.4
@@ -209,8 +258,10 @@ def test_derivatives_are_those_of_the_cost(fitted):
     for k in range(len(normal.gradient)):
         step = np.zeros(len(normal.gradient))
         step[k] = 1e-3 / math.sqrt(normal.hessian[k, k])
-        up, down = (cost_of(adjustment.moved_state(state, normal, sign * step), arguments,
-                            sigma)[0] for sign in (1.0, -1.0))
+        up, down = (
+            cost_of(adjustment.moved_state(state, normal, sign * step), arguments, sigma)[0]
+            for sign in (1.0, -1.0)
+        )
         half = 0.25 * (up - down) / step[k]
         # In sigmas of the unknown: far below the noise.
         assert abs(half - normal.gradient[k]) < 3e-3 * math.sqrt(normal.hessian[k, k]), k
@@ -221,27 +272,36 @@ def independent_residuals(x, tracks, priors, sigma, f0):
     V, N = len(tracks.used), tracks.number
     observations = np.moveaxis(tracks.observations, 2, -1).reshape(V, -1, adjustment.VALUES)[:, :N]
     t, log_k, b, e = x[:3] / np.linalg.norm(x[:3]), x[3], x[4:7], x[7:10]
-    phi = np.vstack([np.zeros(3), x[10:10 + 3 * V - 3].reshape(-1, 3)])
-    own = x[10 + 3 * V - 3:].reshape(N, 3)
+    phi = np.vstack([np.zeros(3), x[10 : 10 + 3 * V - 3].reshape(-1, 3)])
+    own = x[10 + 3 * V - 3 :].reshape(N, 3)
     T, out = tracks.duration, []
     f = f0 + own[:, 0:1] * np.array([1.0, 0, 0]) + own[:, 1:2] * np.array([0, 1.0, 0])
     f /= np.linalg.norm(f, axis=1)[:, None]
     for v in range(V):
         measured, to_pixels, s, moved = np.split(observations[v], [3, 9, 10], axis=1)
         p = s / T * t + np.exp(log_k) * (moved + 0.5 * e * (s * s - T * s))
-        R = np.einsum('nij,jk->nik', Rotation.from_rotvec(phi[v] + s * b).as_matrix(),
-                      tracks.rotations[v])
+        R = np.einsum(
+            'nij,jk->nik', Rotation.from_rotvec(phi[v] + s * b).as_matrix(), tracks.rotations[v]
+        )
         ray = np.einsum('nji,nj->ni', R, f - own[:, 2:] * p)
         ray /= np.linalg.norm(ray, axis=1)[:, None]
         r = np.einsum('nij,nj->ni', to_pixels.reshape(-1, 2, 3), ray - measured) / sigma
         q = 0.25 * np.sum(r * r, axis=1, keepdims=True) + 1e-12
         out.append((r * np.sqrt(np.log1p(q) / q))[tracks.used[v].ravel()[:N]].ravel())
     information = np.linalg.cholesky(priors.rotation_information).T
-    return np.concatenate([
-        *out, information @ phi[1:].ravel(), own[:, 2] / adjustment._INVERSE_DISTANCE_SIGMA,
-        [math.sqrt(priors.log_scale_weight) * (log_k - priors.log_scale),
-         10.0 * (np.linalg.norm(x[:3]) - 1.0)],
-        math.sqrt(priors.acceleration_weights[0]) * e, math.sqrt(priors.bias_weight) * b])
+    return np.concatenate(
+        [
+            *out,
+            information @ phi[1:].ravel(),
+            own[:, 2] / adjustment._INVERSE_DISTANCE_SIGMA,
+            [
+                math.sqrt(priors.log_scale_weight) * (log_k - priors.log_scale),
+                10.0 * (np.linalg.norm(x[:3]) - 1.0),
+            ],
+            math.sqrt(priors.acceleration_weights[0]) * e,
+            math.sqrt(priors.bias_weight) * b,
+        ]
+    )
 
 
 def test_optimum_is_that_of_an_independent_fit():
@@ -249,26 +309,43 @@ def test_optimum_is_that_of_an_independent_fit():
     calls = []
     adjust = adjustment.adjust
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frames_between.adjustment, 'adjust',
-                      lambda *a: (calls.append(a), adjust(*a))[1])
+        patch.setattr(
+            frames_between.adjustment, 'adjust', lambda *a: (calls.append(a), adjust(*a))[1]
+        )
         scene.pose()
     tracks, priors, start, expected, weight = calls[0]
     adjusted = adjust(tracks, priors, start, expected, weight)
-    for _ in range(6):   # far beyond the steps of an estimate
+    for _ in range(6):  # far beyond the steps of an estimate
         adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)
     sigma = math.hypot(adjusted.sigma, adjustment._COMMON_SIGMA)
     directions, rho = start.tracks[0, :3, :25].T, start.tracks[0, adjustment.INVERSE_DISTANCE, :25]
-    begin = np.concatenate([start.t, [start.log_scale], start.bias, start.accelerations[0],
-                            start.rotations[1:].ravel(),
-                            np.column_stack([np.zeros((25, 2)), rho]).ravel()])
+    begin = np.concatenate(
+        [
+            start.t,
+            [start.log_scale],
+            start.bias,
+            start.accelerations[0],
+            start.rotations[1:].ravel(),
+            np.column_stack([np.zeros((25, 2)), rho]).ravel(),
+        ]
+    )
     found = least_squares(
-        independent_residuals, begin, args=(tracks, priors, sigma, directions),
-        x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        independent_residuals,
+        begin,
+        args=(tracks, priors, sigma, directions),
+        x_scale='jac',
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+    )
     n = len(adjusted.covariance)
-    away = np.r_[found.x[:3] / np.linalg.norm(found.x[:3]) - adjusted.state.t,
-                 found.x[3] - adjusted.state.log_scale, found.x[4:7] - adjusted.state.bias,
-                 found.x[7:10] - adjusted.state.accelerations[0],
-                 found.x[10:1 + n] - adjusted.state.rotations[1:].ravel()]
+    away = np.r_[
+        found.x[:3] / np.linalg.norm(found.x[:3]) - adjusted.state.t,
+        found.x[3] - adjusted.state.log_scale,
+        found.x[4:7] - adjusted.state.bias,
+        found.x[7:10] - adjusted.state.accelerations[0],
+        found.x[10 : 1 + n] - adjusted.state.rotations[1:].ravel(),
+    ]
     sigmas = np.sqrt(np.diag(adjusted.covariance))
     assert np.abs(away[3:] / sigmas[2:]).max() < 0.05
     assert np.abs(away[:3]).max() < 0.05 * sigmas[:2].min()
@@ -282,23 +359,44 @@ def test_no_frames_between_change_nothing(scene):
     two = scene.pose(between=())
     nothing = np.full((len(scene.arguments['points1']), 2), np.nan)
     lost = [replace(frame, points=nothing) for frame in scene.between]
-    blind = [replace(frame, relative_rotation=None, relative_rotation_covariance=None,
-                     inertial=None) for frame in scene.between]
+    blind = [
+        replace(frame, relative_rotation=None, relative_rotation_covariance=None, inertial=None)
+        for frame in scene.between
+    ]
     # A gyro that rotates the other way.
-    turned = [replace(frame, relative_rotation=frame.relative_rotation.T)
-              for frame in scene.between]
+    turned = [
+        replace(frame, relative_rotation=frame.relative_rotation.T) for frame in scene.between
+    ]
     default = estimate_relative_pose(**scene.arguments)
-    for other, reason in ((default, ''), (scene.pose(between=lost), 'no frame between'),
-                          (scene.pose(between=blind), 'no frame between'),
-                          (scene.pose(between=turned), 'tracks and gyro')):
+    for other, reason in (
+        (default, ''),
+        (scene.pose(between=lost), 'no frame between'),
+        (scene.pose(between=blind), 'no frame between'),
+        (scene.pose(between=turned), 'tracks and gyro'),
+    ):
         assert other.frames == 2 and other.frames_reason.startswith(reason)
         assert bool(reason) == bool(other.frames_reason)
-        for name in ('R', 't', 'covariance', 'linear_velocity1', 'linear_velocity2', 'inliers',
-                     'baseline', 'baseline_log_sigma', 'velocity_covariance', 'pixel_sigma'):
-            np.testing.assert_allclose(getattr(other, name), getattr(two, name),
-                                       rtol=1e-7 if reason else 0.0, atol=1e-12 if reason else 0.0)
-    without_gyro = scene.pose(relative_rotation=None, relative_rotation_covariance=None,
-                              inertial=None)
+        for name in (
+            'R',
+            't',
+            'covariance',
+            'linear_velocity1',
+            'linear_velocity2',
+            'inliers',
+            'baseline',
+            'baseline_log_sigma',
+            'velocity_covariance',
+            'pixel_sigma',
+        ):
+            np.testing.assert_allclose(
+                getattr(other, name),
+                getattr(two, name),
+                rtol=1e-7 if reason else 0.0,
+                atol=1e-12 if reason else 0.0,
+            )
+    without_gyro = scene.pose(
+        relative_rotation=None, relative_rotation_covariance=None, inertial=None
+    )
     assert without_gyro.frames == 2 and 'gyro' in without_gyro.frames_reason
     paper = scene.pose(config=EstimatorConfig(refinement='none'))
     assert paper.frames == 2 and 'two views' in paper.frames_reason
@@ -321,8 +419,9 @@ def test_tracks_may_be_missing_and_wrong(scene):
 
 @pytest.mark.parametrize('solo', [True, False], ids=['one frame', 'no accelerometer'])
 def test_less_is_enough(scene, solo):
-    between = scene.between[1:2] if solo else [replace(frame, inertial=None)
-                                               for frame in scene.between]
+    between = (
+        scene.between[1:2] if solo else [replace(frame, inertial=None) for frame in scene.between]
+    )
     pose = scene.pose(between=between)
     error, _ = scene.error(pose)
     assert pose.frames == len(between) + 2
@@ -330,23 +429,27 @@ def test_less_is_enough(scene, solo):
 
 
 def test_uncertain_direction_is_decided_by_all_frames(scene):
-    certain = EstimatorConfig(max_translation_sigma=1.05 * np.degrees(np.sqrt(
-        np.trace(scene.pose().covariance[:3, :3]))))
+    certain = EstimatorConfig(
+        max_translation_sigma=1.05 * np.degrees(np.sqrt(np.trace(scene.pose().covariance[:3, :3])))
+    )
     assert scene.pose(config=certain).status is Status.OK
     assert scene.pose(config=certain, between=()).status is Status.LOW_PARALLAX
 
 
-@pytest.mark.parametrize(('change', 'message'), [
-    (lambda f: [replace(f[0], points=f[0].points[1:]), *f[1:]], 'points of a frame between'),
-    (lambda f: f[::-1], 'must increase'),
-    (lambda f: [replace(f[0], interval=TIMES[-1], inertial=None)], 'less than interval'),
-    (lambda f: [replace(f[0], points=np.zeros((150, 3)))], 'shape'),
-    (lambda f: [replace(f[0], interval=-0.1, inertial=None)], 'interval of a frame between'),
-    (lambda f: [replace(f[0], interval=0.05)], 'duration'),
-    (lambda f: [replace(f[0], relative_rotation=None)], 'go together'),
-    (lambda f: [replace(f[0], relative_rotation=2.0 * np.eye(3))], 'rotation matrix'),
-    (lambda f: [replace(f[0], relative_rotation_covariance=-np.eye(3))], 'covariance'),
-])
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (lambda f: [replace(f[0], points=f[0].points[1:]), *f[1:]], 'points of a frame between'),
+        (lambda f: f[::-1], 'must increase'),
+        (lambda f: [replace(f[0], interval=TIMES[-1], inertial=None)], 'less than interval'),
+        (lambda f: [replace(f[0], points=np.zeros((150, 3)))], 'shape'),
+        (lambda f: [replace(f[0], interval=-0.1, inertial=None)], 'interval of a frame between'),
+        (lambda f: [replace(f[0], interval=0.05)], 'duration'),
+        (lambda f: [replace(f[0], relative_rotation=None)], 'go together'),
+        (lambda f: [replace(f[0], relative_rotation=2.0 * np.eye(3))], 'rotation matrix'),
+        (lambda f: [replace(f[0], relative_rotation_covariance=-np.eye(3))], 'covariance'),
+    ],
+)
 def test_wrong_arguments(scene, change, message):
     with pytest.raises(InputError, match=message):
         scene.pose(between=change(scene.between))

@@ -39,16 +39,20 @@ from rs_relpose_ros.pipeline.sequencer import MAILBOX_FRAMES, QueuedFrame, Refus
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage
 
 MS = 1_000_000
-INTRINSICS = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0,
-                        image_width=64, image_height=48)
-PARAMETERS = Parameters.from_mapping({'readout_time': 0.02,
-                                      'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]})
+INTRINSICS = Intrinsics(
+    width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0, image_width=64, image_height=48
+)
+PARAMETERS = Parameters.from_mapping(
+    {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
+)
 
 
 # -- errors ----------------------------------------------------------------------------------
 
-def front_end_of(images: list[RawImage], parameters: Parameters = PARAMETERS, *,
-                 offline: bool = True) -> FrontEnd:
+
+def front_end_of(
+    images: list[RawImage], parameters: Parameters = PARAMETERS, *, offline: bool = True
+) -> FrontEnd:
     """Frames that are ready, with all of their IMU samples."""
     front_end = FrontEnd(parameters, offline=offline)
     for ms in range(0, images[-1].stamp_ns // MS + 150, 5):
@@ -58,16 +62,26 @@ def front_end_of(images: list[RawImage], parameters: Parameters = PARAMETERS, *,
     return front_end
 
 
-def noise(ms: int, rng: np.random.Generator, brightest: int = 255,
-          encoding: str = 'mono8') -> RawImage:
+def noise(
+    ms: int, rng: np.random.Generator, brightest: int = 255, encoding: str = 'mono8'
+) -> RawImage:
     kind = np.dtype('u1' if encoding == 'mono8' else '<u2')
     pixels = rng.integers(0, brightest + 1, (48, 64)).astype(kind)
-    return RawImage(pixels.view(np.uint8).ravel(), encoding, 64, 48, 64 * kind.itemsize, False,
-                    ms * MS, 'camera')
+    return RawImage(
+        pixels.view(np.uint8).ravel(),
+        encoding,
+        64,
+        48,
+        64 * kind.itemsize,
+        False,
+        ms * MS,
+        'camera',
+    )
 
 
-def front_end_with(error: Exception, monkeypatch: pytest.MonkeyPatch, *,
-                   offline: bool) -> FrontEnd:
+def front_end_with(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, *, offline: bool
+) -> FrontEnd:
     """Three frames are ready, and the tracking of the second one fails."""
     rng = np.random.default_rng(0)
     front_end = front_end_of([noise(ms, rng) for ms in (50, 100, 150)], offline=offline)
@@ -82,13 +96,17 @@ def front_end_with(error: Exception, monkeypatch: pytest.MonkeyPatch, *,
     return front_end
 
 
-@pytest.mark.parametrize(('encoding', 'brightest', 'dark'), [
-    ('mono8', 12, True), ('mono16', 25, True), ('mono8', 0, True), ('mono8', 255, False)])
+@pytest.mark.parametrize(
+    ('encoding', 'brightest', 'dark'),
+    [('mono8', 12, True), ('mono16', 25, True), ('mono8', 0, True), ('mono8', 255, False)],
+)
 def test_a_dark_image_is_reported_as_dark(encoding, brightest, dark):
     """Noise up to `brightest`: too few tracks; a black image is dark, and a bright one is not."""
     rng = np.random.default_rng(0)
-    front_end = front_end_of([noise(ms, rng, brightest, encoding) for ms in (50, 100)],
-                             PARAMETERS.updated({'max_keyframe_frames': 1}))
+    front_end = front_end_of(
+        [noise(ms, rng, brightest, encoding) for ms in (50, 100)],
+        PARAMETERS.updated({'max_keyframe_frames': 1}),
+    )
     front_end.sequencer.close()
     [pair] = [outcome.result for outcome in iter(front_end.step, None) if outcome.result]
     assert pair.pose.status is Status.TOO_FEW_MATCHES
@@ -103,7 +121,7 @@ def test_pairs_with_too_few_matches_have_a_bounded_rate():
     frames = [front_end.step() for _ in range(41)]
     pairs = [frame.result for frame in frames if frame.result is not None]
     assert {pair.pose.status for pair in pairs} == {Status.TOO_FEW_MATCHES}
-    assert pairs[0].stamp_ns == frames[1].stamp_ns   # the first at once
+    assert pairs[0].stamp_ns == frames[1].stamp_ns  # the first at once
     assert np.diff([pair.stamp_ns for pair in pairs]).tolist() == [500 * MS] * 3
 
 
@@ -154,10 +172,14 @@ def test_a_busy_worker_costs_no_imu(monkeypatch):
         for ms in range(30 * k - 5, 30 * k + 25, 5):
             sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
         sequencer.add_frame(noise(30 * k, rng), INTRINSICS)
-        assert started.wait(50.0)   # of the first frame
+        assert started.wait(50.0)  # of the first frame
     counts = sequencer.counts()
     assert (counts.imu_gaps, counts.imu_samples, counts.frames_taken, counts.refused) == (
-        0, 240, 1, {Refusal.OVERLOAD: 39 - MAILBOX_FRAMES})
+        0,
+        240,
+        1,
+        {Refusal.OVERLOAD: 39 - MAILBOX_FRAMES},
+    )
     released.set()
     wait_until(lambda: len(held) == 1 + MAILBOX_FRAMES, 'the frames that waited')
     assert worker.stop(10.0)
@@ -169,36 +191,60 @@ def test_a_busy_worker_costs_no_imu(monkeypatch):
 
 # -- pairs -----------------------------------------------------------------------------------
 
-POLICY = KeyframeConfig(min_keyframe_parallax=10.0, max_keyframe_interval=0.5,
-                        max_keyframe_frames=12, min_tracked_fraction=0.3)
+POLICY = KeyframeConfig(
+    min_keyframe_parallax=10.0,
+    max_keyframe_interval=0.5,
+    max_keyframe_frames=12,
+    min_tracked_fraction=0.3,
+)
 
 
-@pytest.mark.parametrize('parallax, interval, frames, fraction, expected', [
-    (9.9, 0.49, 11, 0.3, False),
-    (10.0, 0.03, 1, 1.0, True),
-    (10.0, 0.9, 30, 0.1, True),
-    (0.0, 0.03, 1, 0.29, True),
-    (0.0, 0.5, 3, 1.0, True),
-    (0.0, 0.3, 12, 1.0, True),
-    (np.nan, 0.1, 2, 0.0, True),
-    (np.nan, 0.5, 2, 1.0, True),
-    (np.nan, 0.1, 2, 1.0, False),
-])
+@pytest.mark.parametrize(
+    'parallax, interval, frames, fraction, expected',
+    [
+        (9.9, 0.49, 11, 0.3, False),
+        (10.0, 0.03, 1, 1.0, True),
+        (10.0, 0.9, 30, 0.1, True),
+        (0.0, 0.03, 1, 0.29, True),
+        (0.0, 0.5, 3, 1.0, True),
+        (0.0, 0.3, 12, 1.0, True),
+        (np.nan, 0.1, 2, 0.0, True),
+        (np.nan, 0.5, 2, 1.0, True),
+        (np.nan, 0.1, 2, 1.0, False),
+    ],
+)
 def test_a_keyframe_is_made_by_motion_or_time(parallax, interval, frames, fraction, expected):
-    assert pairs.is_keyframe(POLICY, parallax=parallax, interval=interval, frames=frames,
-                             tracked_fraction=fraction) is expected
+    assert (
+        pairs.is_keyframe(
+            POLICY, parallax=parallax, interval=interval, frames=frames, tracked_fraction=fraction
+        )
+        is expected
+    )
 
 
 # -- parameters that may change while running ------------------------------------------------
 
 # Of each a value that must have an effect on the pairs after it was set.
 CHANGED: dict[str, Any] = {
-    'threshold': 0.3, 'pixel_sigma': 1.5, 'gravity_sigma': 0.3, 'gyro_sigma': 0.1,
-    'confidence': 0.6, 'max_iterations': 2, 'time_limit': 1e-9, 'min_inliers': 5000,
-    'min_parallax': 400.0, 'stamp_sigma': 0.01, 'max_translation_sigma': 0.01,
-    'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
-    'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True,
-    'track_readout_time': True, 'withhold_when_wrong': False}
+    'threshold': 0.3,
+    'pixel_sigma': 1.5,
+    'gravity_sigma': 0.3,
+    'gyro_sigma': 0.1,
+    'confidence': 0.6,
+    'max_iterations': 2,
+    'time_limit': 1e-9,
+    'min_inliers': 5000,
+    'min_parallax': 400.0,
+    'stamp_sigma': 0.01,
+    'max_translation_sigma': 0.01,
+    'min_keyframe_parallax': 2.0,
+    'max_keyframe_interval': 0.01,
+    'max_keyframe_frames': 2,
+    'min_tracked_fraction': 1.0,
+    'track_time_offset': True,
+    'track_readout_time': True,
+    'withhold_when_wrong': False,
+}
 # These have an effect with other parameters only.
 BESIDE: dict[str, dict[str, Any]] = {
     # Many samples are needed: the hypotheses of a solver without priors, few of which fit.
@@ -207,19 +253,23 @@ BESIDE: dict[str, dict[str, Any]] = {
     'max_iterations': {'solver': 'uniform_9pt'},
     'time_limit': {'solver': 'uniform_9pt'},
     # So far off that the consistency monitor reports it as wrong.
-    'withhold_when_wrong': {'time_offset': 0.03}}
+    'withhold_when_wrong': {'time_offset': 0.03},
+}
 # Has an effect on what the node publishes.
 OF_THE_NODE = {'publish_debug_image'}
 FRAMES = 60
-CHANGE_AFTER = 1   # pair
+CHANGE_AFTER = 1  # pair
 
 
 @pytest.fixture(scope='module')
 def parameters(bundled_bag) -> Parameters:
     """With a time offset that is to be found by tracking."""
-    live = {name for name, _, declared in Parameters.declarations()
-            if declared.live and not declared.restarts}
-    assert live == CHANGED.keys() | OF_THE_NODE   # each is tried
+    live = {
+        name
+        for name, _, declared in Parameters.declarations()
+        if declared.live and not declared.restarts
+    }
+    assert live == CHANGED.keys() | OF_THE_NODE  # each is tried
     return read_parameters(bundled_bag.with_name('hand_held.yaml'), ['time_offset=0.003'])
 
 
@@ -247,13 +297,22 @@ def outcomes(recorded: list[Any], front_end: FrontEnd) -> Iterator[Outcome]:
 
 def values_of(pair: PairResult) -> tuple[Any, ...]:
     pose = pair.pose
-    return (pair.reference_stamp_ns, pair.stamp_ns, pose.status, pose.iterations,
-            pose.R.tobytes(), pose.t.tobytes(), pose.covariance.tobytes(),
-            pose.inliers.tobytes(), pair.applied.time_offset)
+    return (
+        pair.reference_stamp_ns,
+        pair.stamp_ns,
+        pose.status,
+        pose.iterations,
+        pose.R.tobytes(),
+        pose.t.tobytes(),
+        pose.covariance.tobytes(),
+        pose.inliers.tobytes(),
+        pair.applied.time_offset,
+    )
 
 
-def pairs_of_run(recorded: list[Any], parameters: Parameters,
-                 changed: Parameters) -> Iterator[tuple[Any, ...]]:
+def pairs_of_run(
+    recorded: list[Any], parameters: Parameters, changed: Parameters
+) -> Iterator[tuple[Any, ...]]:
     """Values of each pair; `changed` is set after the pair `CHANGE_AFTER`."""
     front_end = FrontEnd(parameters, offline=True)
     pairs = 0
@@ -270,8 +329,11 @@ def pairs_of_run(recorded: list[Any], parameters: Parameters,
 def test_a_live_parameter_has_its_effect_from_the_next_frame_on(recorded, parameters, name):
     parameters = parameters.updated(BESIDE.get(name, {}))
     changed = parameters.updated({name: CHANGED[name]})
-    both = zip(pairs_of_run(recorded, parameters, parameters),
-               pairs_of_run(recorded, parameters, changed), strict=False)
+    both = zip(
+        pairs_of_run(recorded, parameters, parameters),
+        pairs_of_run(recorded, parameters, changed),
+        strict=False,
+    )
     for _ in range(CHANGE_AFTER):
         without, with_change = next(both)
         assert with_change == without
@@ -280,8 +342,11 @@ def test_a_live_parameter_has_its_effect_from_the_next_frame_on(recorded, parame
 
 def test_publishing_of_debug_images_can_be_switched_while_running(recorded, parameters):
     front_end = FrontEnd(parameters, offline=True, keep_images=True)
-    pair = next(o.result for o in outcomes(recorded, front_end)
-                if isinstance(o, Frame) and o.result is not None)
+    pair = next(
+        o.result
+        for o in outcomes(recorded, front_end)
+        if isinstance(o, Frame) and o.result is not None
+    )
     publishers: defaultdict[str, Any] = defaultdict(MagicMock)
     publishers['~/debug_image'].get_subscription_count.return_value = 1
     node = MagicMock()
@@ -291,6 +356,7 @@ def test_publishing_of_debug_images_can_be_switched_while_running(recorded, para
         config = parameters.updated({'publish_debug_image': wanted}).pair
         outputs.publish(pair, config, lambda: None)
         assert publishers['~/debug_image'].publish.call_count == pictures
+
 
 IMAGE_MESSAGE = type(build.compressed(build.rosbags_types, b''))
 CARRIERS = (IMAGE_MESSAGE, RawImage, CompressedImage, QueuedFrame, Frame, PairResult)
@@ -310,13 +376,14 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
         if not code.co_filename.startswith(folder) or code.co_name.startswith('<'):
             return
         if event == 'call':
-            names = code.co_varnames[:code.co_argcount + code.co_kwonlyargcount]
+            names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
             own = getattr(type(frame.f_locals.get('self')), code.co_name, None)
             given = any(isinstance(frame.f_locals.get(name), CARRIERS) for name in names)
-            module = code.co_filename[len(folder) + 1:]
+            module = code.co_filename[len(folder) + 1 :]
             crosses = not stack or stack[-1][0][0] != module
-            stack.append([(module, code.co_qualname), given and not isinstance(own, property),
-                          crosses])
+            stack.append(
+                [(module, code.co_qualname), given and not isinstance(own, property), crosses]
+            )
             entered.append(stack[-1])
         elif event == 'return' and stack:
             stack.pop()[1] |= isinstance(argument, CARRIERS)
@@ -324,10 +391,16 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
     node, loop = MagicMock(), FrontEnd(parameters, keep_images=True, clock=lambda: 0)
     node.create_subscription.return_value.handle.take_message.return_value = None
     inputs = SensorInputs(node, Intake(loop.sequencer, parameters), 'compressed', pytest.fail)
-    relpose = MagicMock(spec=RelposeNode, _outputs=PairPublishers(node, parameters.pair),
-                        _settings=MagicMock(current=parameters), _statistics=Statistics(),
-                        _frame_statistics=MagicMock(), _log_health=MagicMock(),
-                        _stamps=None, _timings=None)
+    relpose = MagicMock(
+        spec=RelposeNode,
+        _outputs=PairPublishers(node, parameters.pair),
+        _settings=MagicMock(current=parameters),
+        _statistics=Statistics(),
+        _frame_statistics=MagicMock(),
+        _log_health=MagicMock(),
+        _stamps=None,
+        _timings=None,
+    )
     relpose._on_processed = partial(RelposeNode._on_processed, relpose)
     for role, message in recorded:
         if role is not Role.IMAGE:
@@ -348,7 +421,7 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
             if isinstance(outcome, Frame) and outcome.result is not None and outcome.result.pose:
                 walk: dict[tuple[str, str], bool] = {}
                 for name, carries, crosses in entered:
-                    if name == ('nodes/diagnostics.py', 'Statistics.add_pair'):   # published
+                    if name == ('nodes/diagnostics.py', 'Statistics.add_pair'):  # published
                         return walk
                     if carries:
                         walk[name] = crosses or walk.get(name, False)
@@ -358,8 +431,10 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
 def test_the_walk_of_one_image_is_short(recorded, parameters):
     """As in docs/architecture.md: the functions that carry it, and the steps between modules."""
     walk = walk_of_a_pair(recorded, parameters)
-    print(*(f'{"" if crosses else "    "}{": ".join(name)}' for name, crosses in walk.items()),
-          sep='\n')
+    print(
+        *(f'{"" if crosses else "    "}{": ".join(name)}' for name, crosses in walk.items()),
+        sep='\n',
+    )
     assert next(iter(walk)) == ('nodes/inputs.py', 'SensorInputs._on_image')
     assert walk['pipeline/sequencer.py', 'Sequencer.take']
     assert walk['messages/outgoing.py', 'pair_parts']
@@ -369,9 +444,18 @@ def test_the_walk_of_one_image_is_short(recorded, parameters):
 
 # -- derotated rays and their parallax ------------------------------------------------------------
 
-LENS_INTRINSICS = Intrinsics(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
-                             distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),
-                             image_width=640, image_height=480)
+LENS_INTRINSICS = Intrinsics(
+    width=640,
+    height=480,
+    fx=450.0,
+    fy=450.0,
+    cx=320.0,
+    cy=240.0,
+    distortion_model='plumb_bob',
+    distortion=(-0.2, 0.05, 0.0, 0.0),
+    image_width=640,
+    image_height=480,
+)
 LENS_CAMERA = replace(LENS_INTRINSICS.global_shutter_camera(), readout_time=0.03)
 LENS = Sensor(LENS_CAMERA, LENS_INTRINSICS, ImageClock(LENS_CAMERA))
 MOTION = FrameMotion([0.4, -0.8, 0.3])

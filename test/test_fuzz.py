@@ -34,11 +34,13 @@ from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Sequencer, WAITING_FRAMES
 from rs_relpose_ros.tracking.images import ENCODINGS
 
-PARAMETERS = Parameters.from_mapping({
-    'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]})
+PARAMETERS = Parameters.from_mapping(
+    {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
+)
 WIDTH, HEIGHT = 32, 24
-CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=30.0, fy=30.0, cx=15.5, cy=11.5,
-                              readout_time=0.02)
+CAMERA = RollingShutterCamera(
+    width=WIDTH, height=HEIGHT, fx=30.0, fy=30.0, cx=15.5, cy=11.5, readout_time=0.02
+)
 # No input of these sizes takes so long [s].
 PATIENCE = 100
 MOST_MEMORY_MB = 100.0
@@ -48,8 +50,10 @@ edits = st.lists(st.tuples(numbers, numbers, numbers), min_size=1, max_size=4)
 
 
 def share_and_all(share: int, full: int, seconds: int) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize('count', [
-        share, pytest.param(full, marks=[pytest.mark.long, pytest.mark.timeout(seconds)])])
+    return pytest.mark.parametrize(
+        'count',
+        [share, pytest.param(full, marks=[pytest.mark.long, pytest.mark.timeout(seconds)])],
+    )
 
 
 def outcomes_of(attempt: Callable[..., Any], count: int, *strategies: Any) -> Counter[str]:
@@ -92,8 +96,9 @@ START_NS = 1_700_000_000 * 10**9
 INTERVAL_NS = 5_000_000
 IMU_PER_IMAGE = 6
 # What a message is damaged by: nothing, its bytes, or its fields.
-damages = st.one_of(st.none(), st.tuples(st.just(damaged), edits),
-                    st.tuples(st.just(with_other_fields), edits))
+damages = st.one_of(
+    st.none(), st.tuples(st.just(damaged), edits), st.tuples(st.just(with_other_fields), edits)
+)
 
 
 def message_of(number: int, rng: np.random.Generator) -> tuple[Role, Any]:
@@ -102,19 +107,30 @@ def message_of(number: int, rng: np.random.Generator) -> tuple[Role, Any]:
     kind = number % (IMU_PER_IMAGE + 2)
     if kind == 0:
         return Role.CAMERA_INFO, build.camera_info(
-            types, width=WIDTH, height=HEIGHT, stamp_ns=stamp_ns,
-            k=tuple(CAMERA.camera_matrix.ravel()))
+            types,
+            width=WIDTH,
+            height=HEIGHT,
+            stamp_ns=stamp_ns,
+            k=tuple(CAMERA.camera_matrix.ravel()),
+        )
     if kind == 1:
         pixels = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
         if rng.random() < 0.5:
             extension = '.jpg' if rng.random() < 0.7 else '.png'
             return Role.IMAGE, build.compressed(
-                types, cv2.imencode(extension, pixels)[1].tobytes(), stamp_ns)
+                types, cv2.imencode(extension, pixels)[1].tobytes(), stamp_ns
+            )
         # Enough bytes for any encoding.
         encoding = 'mono8' if rng.random() < 0.5 else str(rng.choice(ENCODINGS))
         return Role.IMAGE, build.image(
-            types, WIDTH, HEIGHT, encoding, rng.bytes(4 * WIDTH * HEIGHT), step=4 * WIDTH,
-            stamp_ns=stamp_ns)
+            types,
+            WIDTH,
+            HEIGHT,
+            encoding,
+            rng.bytes(4 * WIDTH * HEIGHT),
+            step=4 * WIDTH,
+            stamp_ns=stamp_ns,
+        )
     role = Role.ACCEL if rng.random() < 0.1 else Role.IMU
     gyro, force = rng.normal(size=(2, 3)).tolist()
     return role, build.imu(types, stamp_ns, tuple(gyro), tuple(force))
@@ -130,7 +146,8 @@ def with_damage(message: Any, damage: Any) -> Any:
     name = message.__msgtype__
     try:
         return build.TYPESTORE.deserialize_cdr(
-            way(bytes(build.TYPESTORE.serialize_cdr(message, name)), changes), name)
+            way(bytes(build.TYPESTORE.serialize_cdr(message, name)), changes), name
+        )
     except Exception:  # noqa: BLE001
         return None
 
@@ -164,8 +181,9 @@ def receive(seed: int, plan: list[Any]) -> Counter[str]:
 
 @share_and_all(50, 1250, 1300)
 def test_damaged_messages(count):
-    outcomes = outcomes_of(receive, count, st.integers(0, 2**32 - 1),
-                           st.lists(damages, min_size=80, max_size=80))
+    outcomes = outcomes_of(
+        receive, count, st.integers(0, 2**32 - 1), st.lists(damages, min_size=80, max_size=80)
+    )
     total = 80 * count
     # Good ones between the bad ones still get through.
     assert outcomes['used'] > 0.5 * total
@@ -174,6 +192,7 @@ def test_damaged_messages(count):
 
 
 # --- bags
+
 
 def sensor_messages() -> list[bags.Entry]:
     """A few frames of a camera with an IMU."""
@@ -203,13 +222,17 @@ def read(bag: Path) -> str:
         return 'refused'
 
 
-@pytest.mark.timeout(600)   # the kernels may not be compiled yet
+@pytest.mark.timeout(600)  # the kernels may not be compiled yet
 @share_and_all(100, 10_000, 3700)
 def test_damaged_bags(tmp_path, count):
     messages = sensor_messages()
     originals = {kind: bags.write_kind(kind, tmp_path, messages) for kind in bags.KINDS}
-    contents = {kind: {file: file.read_bytes() for file in (
-        [bag] if bag.is_file() else sorted(bag.iterdir()))} for kind, bag in originals.items()}
+    contents = {
+        kind: {
+            file: file.read_bytes() for file in ([bag] if bag.is_file() else sorted(bag.iterdir()))
+        }
+        for kind, bag in originals.items()
+    }
     for kind, bag in originals.items():
         assert read(bag) == 'read', kind
 
@@ -228,8 +251,11 @@ def test_damaged_bags(tmp_path, count):
 
 # --- recordings
 
-@pytest.mark.parametrize('make, reader', [
-    (make_tables, read_tables), (make_posecam, read_posecam), (make_realsense, read_realsense)])
+
+@pytest.mark.parametrize(
+    'make, reader',
+    [(make_tables, read_tables), (make_posecam, read_posecam), (make_realsense, read_realsense)],
+)
 @share_and_all(30, 1000, 1300)
 def test_damaged_recordings(tmp_path, count, make, reader):
     folder = make(tmp_path / 'in')

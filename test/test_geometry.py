@@ -25,14 +25,19 @@ vectors = hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 
 # --- small vectors and rotations
 
+
 @given(hnp.arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), st.booleans())
 def test_products_equal_numpy(values, as_tuples):
     a, b, M = values[0], values[1], values[2:]
     x, y = (tuple(v.tolist()) if as_tuples else v for v in (a, b))
     assert so3.dot(x, y) == pytest.approx(a @ b, rel=1e-14, abs=1e-13)
     assert so3.norm(x) == pytest.approx(np.linalg.norm(a), rel=1e-14)
-    for ours, numpys in ((so3.cross(x, y), np.cross(a, b)), (so3.rotated(M, x), M @ a),
-                         (so3.rotated_back(M, x), M.T @ a), (so3.skew(a) @ b, np.cross(a, b))):
+    for ours, numpys in (
+        (so3.cross(x, y), np.cross(a, b)),
+        (so3.rotated(M, x), M @ a),
+        (so3.rotated_back(M, x), M.T @ a),
+        (so3.skew(a) @ b, np.cross(a, b)),
+    ):
         np.testing.assert_allclose(ours, numpys, rtol=1e-13, atol=1e-12)
 
 
@@ -59,8 +64,11 @@ def test_alignment_recovers_the_rotation(vector, seed):
     np.testing.assert_allclose(so3.aligning_rotation(R.apply(b).T @ b), R.as_matrix(), atol=1e-9)
 
 
-@given(hnp.arrays(np.float64, st.integers(1, 101),
-                  elements=st.integers(-3, 3) | st.floats(allow_nan=False)))
+@given(
+    hnp.arrays(
+        np.float64, st.integers(1, 101), elements=st.integers(-3, 3) | st.floats(allow_nan=False)
+    )
+)
 def test_every_rank_and_the_median(values):
     ordered = np.sort(values)
     for k in range(len(values)):
@@ -68,7 +76,7 @@ def test_every_rank_and_the_median(values):
         assert so3.smallest(reordered, k) == ordered[k]
         assert reordered[:k].max(initial=-np.inf) <= reordered[k] <= reordered[k:].min()
         np.testing.assert_array_equal(np.sort(reordered), ordered)
-    with np.errstate(all='ignore'):   # the mean of two infinite or huge values
+    with np.errstate(all='ignore'):  # the mean of two infinite or huge values
         assert so3.median(values.copy()) == pytest.approx(np.median(values), nan_ok=True)
 
 
@@ -80,16 +88,26 @@ MODELS = [
     ('plumb_bob', (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)),
     ('plumb_bob', (-0.3, 0.12, 1e-3, -5e-4, -0.02)),
     ('rational_polynomial', (0.5, 0.1, 1e-4, -1e-4, 0.01, 0.6, 0.2, 0.02)),
-    ('rational_polynomial',
-     (0.5, 0.1, 1e-4, -1e-4, 0.01, 0.6, 0.2, 0.02, 1e-3, -2e-4, 5e-4, 1e-4)),
+    (
+        'rational_polynomial',
+        (0.5, 0.1, 1e-4, -1e-4, 0.01, 0.6, 0.2, 0.02, 1e-3, -2e-4, 5e-4, 1e-4),
+    ),
     ('equidistant', (-0.01, 0.005, -0.001, 0.0001)),
 ]
 PIXELS = np.random.default_rng(0).uniform([0, 0], [751, 479], (200, 2))
 
 
 def make_camera(model='plumb_bob', distortion=(), **changes):
-    values = {'width': 752, 'height': 480, 'fx': 458.654, 'fy': 457.296, 'cx': 367.215,
-              'cy': 248.375, 'readout_time': 0.024, **changes}
+    values = {
+        'width': 752,
+        'height': 480,
+        'fx': 458.654,
+        'fy': 457.296,
+        'cx': 367.215,
+        'cy': 248.375,
+        'readout_time': 0.024,
+        **changes,
+    }
     return RollingShutterCamera(distortion_model=model, distortion=distortion, **values)
 
 
@@ -99,8 +117,13 @@ def test_opencv_projects_the_ray_back_to_its_pixel(model, distortion):
     rays, jacobian = camera.unproject_with_jacobian(PIXELS)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
     project = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
-    back, _ = project((7.0 * rays)[:, None, :], np.zeros(3), np.zeros(3), camera.camera_matrix,
-                      np.array(distortion or (0.0,) * 4))
+    back, _ = project(
+        (7.0 * rays)[:, None, :],
+        np.zeros(3),
+        np.zeros(3),
+        camera.camera_matrix,
+        np.array(distortion or (0.0,) * 4),
+    )
     np.testing.assert_allclose(back.reshape(-1, 2), PIXELS, atol=1e-8)
     np.testing.assert_allclose(camera.project(7.0 * rays), PIXELS, atol=1e-8)
     for k, step in enumerate(1e-4 * np.eye(2)):
@@ -124,9 +147,16 @@ def test_no_mirror_images():
 SPAN = 0.024 * 479 / 480
 
 
-@pytest.mark.parametrize(('reference', 'direction', 'first', 'last'), [
-    ('first', 'down', 0.0, SPAN), ('middle', 'down', -SPAN / 2, SPAN / 2),
-    ('last', 'down', -SPAN, 0.0), ('first', 'up', 0.0, -SPAN), ('last', 'up', SPAN, 0.0)])
+@pytest.mark.parametrize(
+    ('reference', 'direction', 'first', 'last'),
+    [
+        ('first', 'down', 0.0, SPAN),
+        ('middle', 'down', -SPAN / 2, SPAN / 2),
+        ('last', 'down', -SPAN, 0.0),
+        ('first', 'up', 0.0, -SPAN),
+        ('last', 'up', SPAN, 0.0),
+    ],
+)
 def test_row_times(reference, direction, first, last):
     camera = make_camera(reference_row=reference, readout_direction=direction)
     np.testing.assert_allclose(camera.row_times([0.0, 479.0]), [first, last], atol=1e-15)
@@ -134,28 +164,45 @@ def test_row_times(reference, direction, first, last):
 
 
 def test_clock_of_an_image():
-    clock = ImageClock(make_camera(reference_row='last'), time_offset=-0.002,
-                       stamp_exposure='end', exposure_time=0.004)
+    clock = ImageClock(
+        make_camera(reference_row='last'),
+        time_offset=-0.002,
+        stamp_exposure='end',
+        exposure_time=0.004,
+    )
     # The stamp ends the last row's exposure: its middle was 2 ms before, on a clock 2 ms ahead.
     assert clock.reference_ns(10**9) == 10**9 - 4_000_000
     start, end = clock.exposed_span_ns(10**9)
     assert end == 10**9 - 2_000_000
     assert end - start == to_nanoseconds(SPAN + 0.004)
     automatic = replace(clock, exposure_time=0.0, exposure_margin=0.008, reference_interval=0.02)
-    assert [automatic.exposure(interval) for interval in (None, 50_000_000, 5_000_000)] \
-        == pytest.approx([0.012, 0.042, 0.0])
+    assert [
+        automatic.exposure(interval) for interval in (None, 50_000_000, 5_000_000)
+    ] == pytest.approx([0.012, 0.042, 0.0])
     assert automatic.reference_ns(10**9, 50_000_000) == 10**9 - 23_000_000
     epoch = 1_650_458_790_634_415_865
     assert to_nanoseconds(seconds_between(epoch, epoch + 1)) == 1
 
 
-INTRINSICS = Intrinsics(width=752, height=480, fx=458.654, fy=457.296, cx=367.215, cy=248.375,
-                        image_width=376, image_height=200, binning_x=2, binning_y=2, y_offset=40)
+INTRINSICS = Intrinsics(
+    width=752,
+    height=480,
+    fx=458.654,
+    fy=457.296,
+    cx=367.215,
+    cy=248.375,
+    image_width=376,
+    image_height=200,
+    binning_x=2,
+    binning_y=2,
+    y_offset=40,
+)
 
 
 def test_camera_and_clock_of_a_parameter_set():
-    config = SensorConfig(readout_time=0.03, pose_row='middle', stamp_row='first',
-                          time_offset=0.001)
+    config = SensorConfig(
+        readout_time=0.03, pose_row='middle', stamp_row='first', time_offset=0.001
+    )
     sensor = sensor_model(INTRINSICS, config)
     assert sensor is sensor_model(INTRINSICS, config)
     middle = 0.03 * 239.5 / 480
@@ -172,18 +219,27 @@ def test_camera_and_clock_of_a_parameter_set():
 
 # --- motion during the readout
 
+
 def wobble(t):
     return np.array([0.6 * np.sin(9.0 * t + 0.3), -0.8 * np.cos(7.0 * t), 0.5 + 2.0 * t])
 
 
 def true_rotation(end):
     """Independent integral of the quaternion's differential equation."""
+
     def derivative(t, q):
         x, y, z = wobble(t)
         # q' = q * (w / 2), scalar last
         a, b, c, d = q
-        return 0.5 * np.array([d * x + b * z - c * y, d * y + c * x - a * z,
-                               d * z + a * y - b * x, -a * x - b * y - c * z])
+        return 0.5 * np.array(
+            [
+                d * x + b * z - c * y,
+                d * y + c * x - a * z,
+                d * z + a * y - b * x,
+                -a * x - b * y - c * z,
+            ]
+        )
+
     solved = solve_ivp(derivative, (0.0, end), [0.0, 0.0, 0.0, 1.0], rtol=1e-11, atol=1e-12)
     return Rotation.from_quat(solved.y[:, -1])
 
@@ -193,11 +249,11 @@ def test_gyro_integral_equals_the_differential_equation():
         found = Rotation.from_matrix(motion.rotations([tau])[0])
         return (found.inv() * true_rotation(tau)).magnitude()
 
-    times = np.arange(-0.01, 0.0351, 0.0025)   # a gyro of 400 Hz
+    times = np.arange(-0.01, 0.0351, 0.0025)  # a gyro of 400 Hz
     motion = FrameMotion.from_gyro(times, [wobble(t) for t in times])
     for tau in (-0.0088, 0.0, 0.0117, 0.03, 0.0333):
         assert error(motion, tau) < 1e-5
-    assert error(FrameMotion(wobble(0.0)), 0.0333) > 5e-4   # at a constant rate
+    assert error(FrameMotion(wobble(0.0)), 0.0333) > 5e-4  # at a constant rate
 
 
 @given(vectors, st.floats(-0.05, 0.05))
@@ -206,8 +262,9 @@ def test_derotated_rays_are_those_of_the_reference_row(rate, tau):
     rotation = Rotation.from_rotvec(tau * rate)
     motion = FrameMotion(rate)
     np.testing.assert_allclose(motion.rotations([tau])[0], rotation.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(motion.derotate(rotation.inv().apply(world), [tau]), world,
-                               atol=1e-12)
+    np.testing.assert_allclose(
+        motion.derotate(rotation.inv().apply(world), [tau]), world, atol=1e-12
+    )
 
 
 def test_shift_of_the_reference_row():
@@ -215,18 +272,24 @@ def test_shift_of_the_reference_row():
     motion = FrameMotion.from_gyro(times, [wobble(t) for t in times], gravity=[0.1, 0.9, 0.2])
     moved = motion.shifted(0.015)
     turn = motion.rotations([0.015])[0]
-    np.testing.assert_allclose(turn @ moved.rotations([0.01])[0], motion.rotations([0.025])[0],
-                               atol=1e-12)
+    np.testing.assert_allclose(
+        turn @ moved.rotations([0.01])[0], motion.rotations([0.025])[0], atol=1e-12
+    )
     np.testing.assert_allclose(turn @ moved.gravity, motion.gravity, atol=1e-12)
 
 
 # --- a pose between other rows, and its inverse
 
+
 def make_state(rng):
     t = rng.normal(size=3)
     return PairState(
-        Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix(), t / np.linalg.norm(t),
-        *rng.normal(size=(4, 3)), rng.normal(), np.zeros((19, 19)))
+        Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix(),
+        t / np.linalg.norm(t),
+        *rng.normal(size=(4, 3)),
+        rng.normal(),
+        np.zeros((19, 19)),
+    )
 
 
 def drawn_factor(rng, t, size):
@@ -237,8 +300,10 @@ def drawn_factor(rng, t, size):
 
 
 def turns(state, delay):
-    return (Rotation.from_rotvec(state.w1 * delay).as_matrix(),
-            Rotation.from_rotvec(state.w2 * delay).as_matrix())
+    return (
+        Rotation.from_rotvec(state.w1 * delay).as_matrix(),
+        Rotation.from_rotvec(state.w2 * delay).as_matrix(),
+    )
 
 
 def moved(state, delay):
@@ -249,8 +314,9 @@ def assert_covariance_of(errors_of, factor, expected):
     """First-order covariance of errors_of(e), where e has that of `factor`, of small columns."""
     columns = np.array([errors_of(e) - errors_of(-e) for e in factor.T]) / 2.0
     sigma = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(columns.T @ columns / np.outer(sigma, sigma),
-                               expected / np.outer(sigma, sigma), atol=1e-6)
+    np.testing.assert_allclose(
+        columns.T @ columns / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-6
+    )
 
 
 def test_pose_between_later_rows():
@@ -279,17 +345,34 @@ def test_covariance_of_the_moved_pose():
     result = moved(replace(state, covariance=factor @ factor.T), delay)
 
     def errors_of(e):
-        true = PairState(Rotation.from_rotvec(e[3:6]).as_matrix() @ state.R, state.t + e[0:3],
-                         state.v1 + e[6:9], state.v2 + e[9:12], state.w1 + e[12:15],
-                         state.w2 + e[15:18], state.log_baseline + e[18], state.covariance)
+        true = PairState(
+            Rotation.from_rotvec(e[3:6]).as_matrix() @ state.R,
+            state.t + e[0:3],
+            state.v1 + e[6:9],
+            state.v2 + e[9:12],
+            state.w1 + e[12:15],
+            state.w2 + e[15:18],
+            state.log_baseline + e[18],
+            state.covariance,
+        )
         # The rates' errors rotate the rows from the left, as the gyro corrections do.
-        true = to_reference_row(true, delay, *(
-            Rotation.from_rotvec(delay * error).as_matrix() @ turn
-            for error, turn in zip((e[12:15], e[15:18]), turns(state, delay), strict=True)))
-        return np.concatenate([
-            true.t - result.t, Rotation.from_matrix(true.R @ result.R.T).as_rotvec(),
-            true.v1 - result.v1, true.v2 - result.v2,
-            [true.log_baseline - result.log_baseline]])
+        true = to_reference_row(
+            true,
+            delay,
+            *(
+                Rotation.from_rotvec(delay * error).as_matrix() @ turn
+                for error, turn in zip((e[12:15], e[15:18]), turns(state, delay), strict=True)
+            ),
+        )
+        return np.concatenate(
+            [
+                true.t - result.t,
+                Rotation.from_matrix(true.R @ result.R.T).as_rotvec(),
+                true.v1 - result.v1,
+                true.v2 - result.v2,
+                [true.log_baseline - result.log_baseline],
+            ]
+        )
 
     kept = [*range(12), 18]
     assert_covariance_of(errors_of, factor, result.covariance[np.ix_(kept, kept)])
@@ -299,8 +382,14 @@ def test_inverse_pose_and_its_covariance():
     rng = np.random.default_rng(3)
     state = make_state(rng)
     factor = drawn_factor(rng, state.t, 6)
-    pose = RelativePose(Status.OK, R=state.R, t=state.t, linear_velocity1=state.v1,
-                        linear_velocity2=state.v2, covariance=factor @ factor.T)
+    pose = RelativePose(
+        Status.OK,
+        R=state.R,
+        t=state.t,
+        linear_velocity1=state.v1,
+        linear_velocity2=state.v2,
+        covariance=factor @ factor.T,
+    )
     inverse = pose.inverse()
     point2 = rng.normal(size=3)
     point1 = pose.R @ point2 + pose.t
@@ -309,8 +398,12 @@ def test_inverse_pose_and_its_covariance():
 
     def errors_of(e):
         R = Rotation.from_rotvec(e[3:]).as_matrix() @ state.R
-        return np.concatenate([-R.T @ (state.t + e[:3]) - inverse.t,
-                               Rotation.from_matrix(R.T @ inverse.R.T).as_rotvec()])
+        return np.concatenate(
+            [
+                -R.T @ (state.t + e[:3]) - inverse.t,
+                Rotation.from_matrix(R.T @ inverse.R.T).as_rotvec(),
+            ]
+        )
 
     assert_covariance_of(errors_of, factor, inverse.covariance)
     np.testing.assert_allclose(inverse.inverse().covariance, pose.covariance, atol=1e-18)
@@ -321,28 +414,61 @@ def test_inverse_pose_and_its_covariance():
 NAN, STEADY = float('nan'), np.zeros((2, 3))
 
 
-@pytest.mark.parametrize(('build', 'name'), [
-    *((lambda changes=changes: make_camera(**changes), name) for changes, name in [
-        ({'width': 0}, 'width'), ({'height': 480.5}, 'height'), ({'fx': 0.0}, 'fx'),
-        ({'cy': NAN}, 'cy'), ({'readout_time': -0.01}, 'readout_time'),
-        ({'readout_time': NAN}, 'readout_time'), ({'reference_row': 'top'}, 'reference_row'),
-        ({'readout_direction': 'left'}, 'readout_direction'),
-        ({'model': 'brown'}, 'distortion_model'), ({'distortion': (0.1, 0.2, 0.3)}, 'distortion'),
-        ({'distortion': (0.1, float('inf'), 0.0, 0.0)}, 'distortion')]),
-    (lambda: FrameMotion([0.0, 1.0, NAN]), 'angular_velocity'),
-    (lambda: FrameMotion([0.0, 1.0]), 'angular_velocity'),
-    (lambda: FrameMotion([0.0, 1.0, 0.0], [0.0, 0.0, 0.0]), 'gravity'),
-    (lambda: FrameMotion.from_gyro([0.0], STEADY[:1]), 'number of times'),
-    *((lambda times=times: FrameMotion.from_gyro(times, STEADY), 'times')
-      for times in ([0.0, 0.0], [0.01, 0.02], [0.0, np.inf])),
-    (lambda: FrameMotion.from_gyro([0.0, 0.01], STEADY).rotations([0.011]), 'row times'),
-    *((lambda changes=changes: InertialMotion(**{
-        'alpha': np.zeros(3), 'beta': np.zeros(3), 'duration': 0.1,
-        'covariance': 1e-4 * np.eye(6), **changes}), next(iter(changes))) for changes in (
-            {'duration': 0.0}, {'duration': -0.1}, {'duration': NAN}, {'alpha': [1.0, 2.0]},
-            {'beta': [1.0, NAN, 0.0]}, {'lever_arm': [30.0, 0.0, 0.0]}, {'covariance': np.eye(3)},
-            {'covariance': -np.eye(6)}, {'acceleration2': [1e9, 0.0, 0.0]})),
-])
+@pytest.mark.parametrize(
+    ('build', 'name'),
+    [
+        *(
+            (lambda changes=changes: make_camera(**changes), name)
+            for changes, name in [
+                ({'width': 0}, 'width'),
+                ({'height': 480.5}, 'height'),
+                ({'fx': 0.0}, 'fx'),
+                ({'cy': NAN}, 'cy'),
+                ({'readout_time': -0.01}, 'readout_time'),
+                ({'readout_time': NAN}, 'readout_time'),
+                ({'reference_row': 'top'}, 'reference_row'),
+                ({'readout_direction': 'left'}, 'readout_direction'),
+                ({'model': 'brown'}, 'distortion_model'),
+                ({'distortion': (0.1, 0.2, 0.3)}, 'distortion'),
+                ({'distortion': (0.1, float('inf'), 0.0, 0.0)}, 'distortion'),
+            ]
+        ),
+        (lambda: FrameMotion([0.0, 1.0, NAN]), 'angular_velocity'),
+        (lambda: FrameMotion([0.0, 1.0]), 'angular_velocity'),
+        (lambda: FrameMotion([0.0, 1.0, 0.0], [0.0, 0.0, 0.0]), 'gravity'),
+        (lambda: FrameMotion.from_gyro([0.0], STEADY[:1]), 'number of times'),
+        *(
+            (lambda times=times: FrameMotion.from_gyro(times, STEADY), 'times')
+            for times in ([0.0, 0.0], [0.01, 0.02], [0.0, np.inf])
+        ),
+        (lambda: FrameMotion.from_gyro([0.0, 0.01], STEADY).rotations([0.011]), 'row times'),
+        *(
+            (
+                lambda changes=changes: InertialMotion(
+                    **{
+                        'alpha': np.zeros(3),
+                        'beta': np.zeros(3),
+                        'duration': 0.1,
+                        'covariance': 1e-4 * np.eye(6),
+                        **changes,
+                    }
+                ),
+                next(iter(changes)),
+            )
+            for changes in (
+                {'duration': 0.0},
+                {'duration': -0.1},
+                {'duration': NAN},
+                {'alpha': [1.0, 2.0]},
+                {'beta': [1.0, NAN, 0.0]},
+                {'lever_arm': [30.0, 0.0, 0.0]},
+                {'covariance': np.eye(3)},
+                {'covariance': -np.eye(6)},
+                {'acceleration2': [1e9, 0.0, 0.0]},
+            )
+        ),
+    ],
+)
 def test_illegal_values_are_refused_by_name(build, name):
     with pytest.raises(InputError, match=f'^{name} '):
         build()

@@ -35,6 +35,7 @@ DELAY_NS = round(239.5 / 480 * 0.03 * SECOND)
 # Images of the bag that are played.
 PLAYED = 60
 
+
 def stamps_of(messages: list[Any]) -> list[int]:
     return [stamp_of(message) for message in messages]
 
@@ -45,8 +46,9 @@ def expected(bundled_bag: Path) -> dict[int, GlobalShutterFrame]:
     parameters = read_parameters(BUNDLED_PARAMETERS)
     loop = unrolling_loop(parameters, offline=True)
     with open_bag(bundled_bag) as bag:
-        found = outcomes(loop, Intake(loop.sequencer, parameters),
-                         sensor_messages(bag, bag.find_topics()))
+        found = outcomes(
+            loop, Intake(loop.sequencer, parameters), sensor_messages(bag, bag.find_topics())
+        )
         frames = (item.result for item in found if isinstance(item, Frame) and item.result)
         return {frame.original_stamp_ns: frame for frame in itertools.islice(frames, PLAYED)}
 
@@ -55,9 +57,15 @@ def expected(bundled_bag: Path) -> dict[int, GlobalShutterFrame]:
 def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleNamespace]:
     """Messages of the first images of the bag."""
     messages = faults.read_messages(bundled_bag, PLAYED / 30.0)
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS, node='global_shutter_node', parameters={
-                'image_transport': 'raw', **faults.reliable(*BAG_TOPICS.values())}) as node:
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS,
+            remap=BAG_TOPICS,
+            node='global_shutter_node',
+            parameters={'image_transport': 'raw', **faults.reliable(*BAG_TOPICS.values())},
+        ) as node,
+    ):
         images, masks = (graph.listen(Image, f'{OWN}/{topic}') for topic in ('image', 'mask'))
         infos = graph.listen(CameraInfo, f'{OWN}/camera_info')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
@@ -68,17 +76,22 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
             for topic in ('image', 'image/compressed', 'mask', 'camera_info'):
                 other.wait_for_publisher(f'{OWN}/{topic}')
             faults.play(publishers, messages)
-        wait_until_quiet(lambda: len(images), 1.0, node)   # a busy machine is behind
+        wait_until_quiet(lambda: len(images), 1.0, node)  # a busy machine is behind
         count = len(diagnostics)
         wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics', node)
         code, seconds = node.signal(signal.SIGINT)
         assert code == 0 and seconds <= 1.0
         yield SimpleNamespace(
-            images=images, compressed=compressed, masks=masks, infos=infos,
+            images=images,
+            compressed=compressed,
+            masks=masks,
+            infos=infos,
             info=next(message for _, message in messages if isinstance(message, CameraInfo)),
             sent=sum(isinstance(message, Image) for _, message in messages),
-            diagnostics=diagnostics, values=diagnostic_values(diagnostics[-1]),
-            output=node.output)
+            diagnostics=diagnostics,
+            values=diagnostic_values(diagnostics[-1]),
+            output=node.output,
+        )
 
 
 def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
@@ -89,7 +102,11 @@ def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
     for message in session.images:
         frame = by_stamp[stamp_of(message)]
         assert (message.encoding, message.width, message.height, message.step) == (
-            'mono8', 640, 480, 640)
+            'mono8',
+            640,
+            480,
+            640,
+        )
         assert message.header.frame_id == 'camera_optical_frame'
         assert bytes(message.data) == frame.image().values.tobytes()
     masks = {stamp_of(message): message for message in session.masks}
@@ -102,8 +119,11 @@ def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
 
 def test_compressed_images_are_the_same(session):
     raw = {stamp_of(message): message for message in session.images}
-    pairs = [(message, raw[stamp_of(message)]) for message in session.compressed
-             if stamp_of(message) in raw]
+    pairs = [
+        (message, raw[stamp_of(message)])
+        for message in session.compressed
+        if stamp_of(message) in raw
+    ]
     assert len(pairs) > 0.55 * PLAYED
     for compressed, image in pairs[::20]:
         assert compressed.format.startswith('mono8; jpeg compressed')
@@ -126,14 +146,20 @@ def test_diagnostics_count_all_frames(session):
     assert status.name == f'{OWN}: global shutter'
     values = session.values
     refused = sum(int(value) for key, value in values.items() if key.startswith('frames_refused_'))
-    assert int(values['frames_received']) == session.sent == int(
-        values['images_published']) + refused
+    assert (
+        int(values['frames_received']) == session.sent == int(values['images_published']) + refused
+    )
     assert values['images_published'] == values['frames_processed']
     assert abs(int(values['images_published']) - len(session.infos)) <= 2
-    documented = ''.join((ROOT / 'docs' / name).read_text(encoding='utf-8')
-                         for name in ('any_slam.md', 'operation.md'))
-    assert [key for key in values if f'`{key}`' not in documented
-            and not key.startswith('frames_refused_')] == []
+    documented = ''.join(
+        (ROOT / 'docs' / name).read_text(encoding='utf-8')
+        for name in ('any_slam.md', 'operation.md')
+    )
+    assert [
+        key
+        for key in values
+        if f'`{key}`' not in documented and not key.startswith('frames_refused_')
+    ] == []
     assert 1.0 < float(values['largest_shift_px']) < 30.0
     assert values['applied_time_offset_ms'] == '0.00'
     assert 0.0 < float(values['latency_p50_ms']) <= float(values['latency_p99_ms'])
@@ -142,21 +168,39 @@ def test_diagnostics_count_all_frames(session):
 
 
 def status_of_relpose(state: str) -> DiagnosticArray:
-    return DiagnosticArray(status=[DiagnosticStatus(
-        name='/relpose_node: relative pose', hardware_id=BAG_TOPICS['image'], values=[
-            KeyValue(key='health', value=state), KeyValue(
-                key='health_findings', value=f'axes ok: a; readout_time {state}: b')])])
+    return DiagnosticArray(
+        status=[
+            DiagnosticStatus(
+                name='/relpose_node: relative pose',
+                hardware_id=BAG_TOPICS['image'],
+                values=[
+                    KeyValue(key='health', value=state),
+                    KeyValue(key='health_findings', value=f'axes ok: a; readout_time {state}: b'),
+                ],
+            )
+        ]
+    )
 
 
 def test_images_of_a_wrong_calibration_are_suppressed(ros_domain_id, bundled_bag):
     """By the own watch, and by relpose_node while it runs."""
-    quaternion = Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(read_parameters(
-        BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw)
+    quaternion = Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(
+        read_parameters(BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw
+    )
     messages = faults.read_messages(bundled_bag, 3.0)
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS, node='global_shutter_node', parameters={
-                'image_transport': 'raw', 'quat_cam_imu_xyzw': quaternion.as_quat().tolist(),
-                **faults.reliable(*BAG_TOPICS.values())}) as node:
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS,
+            remap=BAG_TOPICS,
+            node='global_shutter_node',
+            parameters={
+                'image_transport': 'raw',
+                'quat_cam_imu_xyzw': quaternion.as_quat().tolist(),
+                **faults.reliable(*BAG_TOPICS.values()),
+            },
+        ) as node,
+    ):
         infos = graph.listen(CameraInfo, f'{OWN}/camera_info')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
@@ -167,7 +211,7 @@ def test_images_of_a_wrong_calibration_are_suppressed(ros_domain_id, bundled_bag
         count = len(infos)
         faults.play(publishers, messages, later=10.0)
         wait_until_quiet(lambda: len(infos), 1.0, node)
-        assert len(infos) < count + 5   # the window of the watch begins again after a jump
+        assert len(infos) < count + 5  # the window of the watch begins again after a jump
         values = diagnostic_values(diagnostics[-1])
         assert int(values['images_withheld']) > 60
         assert (values['health'], values['health_source']) == ('wrong', 'own watch')

@@ -36,9 +36,15 @@ FILTERS = pytest.mark.parametrize('gravity_filter', ['complementary', 'mean'])
 def samples(stamps, rates, forces=UP):
     """Messages with both sensors; `rates` and `forces` (3,) or (K, 3)."""
     count = len(stamps)
-    return [ImuSample(int(stamp), tuple(rate), tuple(force)) for stamp, rate, force in zip(
-        stamps, np.broadcast_to(rates, (count, 3)).tolist(),
-        np.broadcast_to(forces, (count, 3)).tolist(), strict=True)]
+    return [
+        ImuSample(int(stamp), tuple(rate), tuple(force))
+        for stamp, rate, force in zip(
+            stamps,
+            np.broadcast_to(rates, (count, 3)).tolist(),
+            np.broadcast_to(forces, (count, 3)).tolist(),
+            strict=True,
+        )
+    ]
 
 
 def filled(items, **config):
@@ -63,6 +69,7 @@ def wobbling(count=100):
 
 # -- Buffer and gyro integration ----------------------------------------------------------------
 
+
 def test_constant_rate_is_the_exponential_of_rate_times_time_without_its_bias():
     rate, bias = np.array([0.2, -1.1, 0.7]), (0.01, -0.02, 0.03)
     buffer = filled(samples(at_200_hz(), rate + bias), gyro_bias=bias)
@@ -78,8 +85,11 @@ def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
     items, arriving = wobbling(60), []
     for k in order:
         one = items[k]
-        arriving += ([replace(one, linear_acceleration=None), replace(one, angular_velocity=None)]
-                     if k in divided else [one])
+        arriving += (
+            [replace(one, linear_acceleration=None), replace(one, angular_velocity=None)]
+            if k in divided
+            else [one]
+        )
     a, b = filled(items), ImuBuffer(ImuConfig())
     query = data.draw(st.integers(0, len(arriving) - 1))
     for k, item in enumerate(arriving):
@@ -101,9 +111,11 @@ def test_coverage():
     for item in wobbling(10):
         buffer.add(item)
     assert buffer.complete(START, end) and not buffer.complete(START, end + 1)
-    for start_ns, end_ns, expected in ((START, end, Coverage.AVAILABLE),
-                                       (START - 1, end, Coverage.NEVER),
-                                       (START, end + 1, Coverage.NOT_YET)):
+    for start_ns, end_ns, expected in (
+        (START, end, Coverage.AVAILABLE),
+        (START - 1, end, Coverage.NEVER),
+        (START, end + 1, Coverage.NOT_YET),
+    ):
         assert buffer.gyro.coverage(start_ns, end_ns) is expected
         assert (buffer.between(start_ns, end_ns) is None) == (expected is not Coverage.AVAILABLE)
     buffer.add(ImuSample(end + 21_000_000, (0.0, 0.0, 0.0), tuple(UP)))
@@ -120,15 +132,22 @@ def test_duplicates_are_reported_and_all_samples_can_be_removed():
     buffer = ImuBuffer(ImuConfig())
     first, second, third = wobbling(3)
     assert [buffer.add(sample) for sample in (first, third, second, second)] == [
-        True, True, True, False]
+        True,
+        True,
+        True,
+        False,
+    ]
     buffer.clear()
     assert buffer.newest_ns is None and buffer.gravity(START + PERIOD) is None
     assert buffer.gyro.coverage(START, START + PERIOD) is Coverage.NOT_YET
     assert buffer.add(replace(first, stamp_ns=0))
 
 
-@given(st.sampled_from(['angular_velocity', 'linear_acceleration']), st.integers(0, 2),
-       st.sampled_from([np.nan, np.inf, -np.inf]))
+@given(
+    st.sampled_from(['angular_velocity', 'linear_acceleration']),
+    st.integers(0, 2),
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+)
 def test_nothing_of_a_broken_sample_is_kept(name, axis, value):
     buffer, broken = ImuBuffer(ImuConfig()), np.zeros(3)
     broken[axis] = value
@@ -169,8 +188,11 @@ def test_covariance_equals_the_spread_of_noisy_integrations():
         noisy, _ = integrate(stamps, rates + noise + rng.normal(size=3) * 5e-3, config, 5e-3)
         errors.append(Rotation.from_matrix(expected @ noisy.T).as_rotvec())
     sigma = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(np.cov(np.array(errors).T) / np.outer(sigma, sigma),
-                               covariance / np.outer(sigma, sigma), atol=0.1)
+    np.testing.assert_allclose(
+        np.cov(np.array(errors).T) / np.outer(sigma, sigma),
+        covariance / np.outer(sigma, sigma),
+        atol=0.1,
+    )
 
 
 def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows():
@@ -184,11 +206,13 @@ def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows(
         dt = (stamps[k + 1] - stamps[k]) * 1e-9
         fractions = (np.arange(2000) + 0.5) / 2000
         for step in Rotation.from_rotvec(
-                (rates[k] + fractions[:, None] * (rates[k + 1] - rates[k])) * dt / 2000):
+            (rates[k] + fractions[:, None] * (rates[k + 1] - rates[k])) * dt / 2000
+        ):
             expected = expected * step
         angles += np.linalg.norm(rates[k]) * dt
         rotation, _ = integration.integrate_rotation(
-            stamps[:k + 2], rates[:k + 2], ImuConfig(), 0.0)
+            stamps[: k + 2], rates[: k + 2], ImuConfig(), 0.0
+        )
         np.testing.assert_allclose(motion.knot_rotations[k + 1], rotation, atol=1e-12)
     # Fourth order; without the term w_0 x w_1 it is 4e-4.
     assert (Rotation.from_matrix(rotation).inv() * expected).magnitude() < 1e-6 * angles
@@ -197,33 +221,46 @@ def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows(
 @pytest.mark.parametrize('exposure', [0.01, 0.03])
 def test_a_frame_turns_with_the_mean_rate_of_its_exposure(exposure):
     """Of a rate ``A sin(2 pi f t)``: its mean over h is smaller by ``sinc(f h)``."""
+
     def rate(stamps):
         return np.outer(np.sin(8e-9 * np.pi * (stamps - START)), [0.3, -0.5, 0.8])
 
     stamps, smaller = at_200_hz(600), np.sinc(4.0 * exposure)
     buffer, reference = filled(samples(stamps, rate(stamps))), START + 1_512_345_678
     half, rows = to_nanoseconds(0.5 * exposure), 30_000_000
-    blurred = frame_imu(buffer, (reference - half, reference + rows + half), reference, np.eye(3),
-                        reference - 66_000_000, exposure)
+    blurred = frame_imu(
+        buffer,
+        (reference - half, reference + rows + half),
+        reference,
+        np.eye(3),
+        reference - 66_000_000,
+        exposure,
+    )
     before = blurred.since_previous
     # Rates that are linear between samples 5 ms apart.
     np.testing.assert_allclose(
-        before.angular_velocities, smaller * rate(before.stamps_ns), atol=3e-3)
+        before.angular_velocities, smaller * rate(before.stamps_ns), atol=3e-3
+    )
     sharp = frame_imu(buffer, (reference, reference + rows), reference, np.eye(3))
-    angles = [Rotation.from_matrix(frame.motion.rotations([0.03])[0]).magnitude()
-              for frame in (blurred, sharp)]
+    angles = [
+        Rotation.from_matrix(frame.motion.rotations([0.03])[0]).magnitude()
+        for frame in (blurred, sharp)
+    ]
     assert angles[0] / angles[1] == pytest.approx(smaller, abs=3e-3)
 
 
 def test_frame_imu_is_in_the_camera_frame_at_the_stamped_row():
     rate = np.array([0.0, 0.0, 0.8])
     buffer, reference = filled(samples(at_200_hz(400), rate)), START + 1_500_000_123
-    answer = frame_imu(buffer, (reference, reference + 30_000_000), reference, R_CAM_IMU,
-                       reference - 66_000_000)
+    answer = frame_imu(
+        buffer, (reference, reference + 30_000_000), reference, R_CAM_IMU, reference - 66_000_000
+    )
     np.testing.assert_allclose(answer.motion.angular_velocity, R_CAM_IMU @ rate, atol=1e-12)
     np.testing.assert_allclose(
         answer.motion.rotations([0.03])[0],
-        Rotation.from_rotvec(0.03 * (R_CAM_IMU @ rate)).as_matrix(), atol=1e-12)
+        Rotation.from_rotvec(0.03 * (R_CAM_IMU @ rate)).as_matrix(),
+        atol=1e-12,
+    )
     np.testing.assert_allclose(answer.motion.gravity, R_CAM_IMU @ [0.0, 0.0, -1.0], atol=1e-9)
     assert answer.since_previous.stamps_ns[[0, -1]].tolist() == [reference - 66_000_000, reference]
     # Of a global shutter.
@@ -275,17 +312,20 @@ def test_the_bias_is_found_at_rest_with_its_sigma():
     assert 0.2 < np.sqrt(np.mean(np.square(normalised))) < 1.2
 
 
-@pytest.mark.parametrize('case', ['hand', 'slow rotation', 'no accelerometer', 'vibration',
-                                  'short', 'gaps', 'off'])
+@pytest.mark.parametrize(
+    'case', ['hand', 'slow rotation', 'no accelerometer', 'vibration', 'short', 'gaps', 'off']
+)
 def test_what_may_be_a_motion_is_no_rest(case):
     """The configured bias and its sigma then stay."""
     rng = np.random.default_rng(1)
-    config = ImuConfig(track_gyro_bias=case != 'off', gyro_bias=(0.001, 0.002, 0.003),
-                       gyro_bias_sigma=0.003)
+    config = ImuConfig(
+        track_gyro_bias=case != 'off', gyro_bias=(0.001, 0.002, 0.003), gyro_bias_sigma=0.003
+    )
     # 2 deg/s is no bias of 3e-3 rad/s.
     rate = (0.0, 0.035, 0.0) if case == 'slow rotation' else (0.0, 0.0, 0.0)
-    still = rest(0.9 if case == 'short' else 5.0, rng, rate,
-                 0.3 if case == 'vibration' else FORCE_NOISE)
+    still = rest(
+        0.9 if case == 'short' else 5.0, rng, rate, 0.3 if case == 'vibration' else FORCE_NOISE
+    )
     moving = hand(1.0, rng)
     stamps, rates, forces = joined(moving, *([] if case == 'hand' else [still]), moving)
     if case == 'no accelerometer':
@@ -321,8 +361,10 @@ def test_sigma_grows_after_rest_and_a_second_rest_follows_a_drift():
     assert sigmas[2] == config.gyro_bias_sigma
     drift = np.array([0.001, 0.001, -0.001])
     second = rest(10.0, rng)
-    found = tracked(config, *joined(rest(5.0, rng), hand(120.0, rng),
-                                    (second[0] + drift, second[1]), hand(1.0, rng)))
+    found = tracked(
+        config,
+        *joined(rest(5.0, rng), hand(120.0, rng), (second[0] + drift, second[1]), hand(1.0, rng)),
+    )
     assert np.abs(found.value - BIAS - drift).max() < 1e-3
 
 
@@ -342,11 +384,14 @@ def test_the_bias_does_not_depend_on_the_portions(borders):
 def test_buffer_and_frame_use_the_bias(gravity_filter):
     rng = np.random.default_rng(7)
     items = samples(*joined(rest(5.0, rng), hand(2.0, rng)))
-    buffer, configured = (filled(items, gravity_filter=gravity_filter, track_gyro_bias=tracking)
-                          for tracking in (True, False))
+    buffer, configured = (
+        filled(items, gravity_filter=gravity_filter, track_gyro_bias=tracking)
+        for tracking in (True, False)
+    )
     at = START + 6 * SECOND
-    segment = frame_imu(buffer, (at, at + 30_000_000), at, R_CAM_IMU,
-                        at - 500_000_000).since_previous
+    segment = frame_imu(
+        buffer, (at, at + 30_000_000), at, R_CAM_IMU, at - 500_000_000
+    ).since_previous
     assert np.abs(segment.bias - R_CAM_IMU @ BIAS).max() < 1.5e-3
     assert segment.bias_sigma < 1e-3
     # Removed from the rates, and within the smaller covariance.
@@ -354,20 +399,34 @@ def test_buffer_and_frame_use_the_bias(gravity_filter):
     np.testing.assert_allclose(segment.angular_velocities, removed @ R_CAM_IMU.T, atol=1e-12)
     known, unknown = (each.rotation(at - 500_000_000, at)[1] for each in (buffer, configured))
     assert np.trace(known) < 0.2 * np.trace(unknown)
-    joint = segment.joined(replace(segment, stamps_ns=segment.stamps_ns + 500_000_000,
-                                   bias=segment.bias + 0.001, bias_sigma=0.5))
+    joint = segment.joined(
+        replace(
+            segment,
+            stamps_ns=segment.stamps_ns + 500_000_000,
+            bias=segment.bias + 0.001,
+            bias_sigma=0.5,
+        )
+    )
     np.testing.assert_allclose(joint.bias, segment.bias + 0.0005)
     assert joint.bias_sigma == 0.5 and joint.duration == pytest.approx(1.0)
 
 
 # -- Gravity --------------------------------------------------------------------------------------
 
+
 def upright(times):
     return np.broadcast_to(np.eye(3), (len(times), 3, 3))
 
 
-def run(orientation=upright, acceleration=lambda times: 0.0, seconds=10.0, seed=0, bias=0.0,
-        noise=0.02, **config):
+def run(
+    orientation=upright,
+    acceleration=lambda times: 0.0,
+    seconds=10.0,
+    seed=0,
+    bias=0.0,
+    noise=0.02,
+    **config,
+):
     """A buffer with samples of a moving IMU at 200 Hz, and the last stamp.
 
     orientation(times) is world from IMU (N, 3, 3), world z up; acceleration(times) (N, 3) is in
@@ -384,8 +443,10 @@ def run(orientation=upright, acceleration=lambda times: 0.0, seconds=10.0, seed=
 
 def swinging(times):
     times = np.atleast_1d(times)
-    return Rotation.from_euler('zyx', np.stack([
-        0.8 * np.sin(2.0 * times), 0.5 * np.cos(1.3 * times), 0.7 * times], axis=1)).as_matrix()
+    return Rotation.from_euler(
+        'zyx',
+        np.stack([0.8 * np.sin(2.0 * times), 0.5 * np.cos(1.3 * times), 0.7 * times], axis=1),
+    ).as_matrix()
 
 
 def down(at_ns):
@@ -395,8 +456,10 @@ def down(at_ns):
 
 def test_hand_held_acceleration_affects_the_mean_and_not_the_filter():
     def shaking(t):
-        return np.stack([1.5 * np.sin(7.0 * t), 1.2 * np.cos(9.0 * t), 0.8 * np.sin(11.0 * t)],
-                        axis=1)
+        return np.stack(
+            [1.5 * np.sin(7.0 * t), 1.2 * np.cos(9.0 * t), 0.8 * np.sin(11.0 * t)], axis=1
+        )
+
     errors = {}
     for mode in ('complementary', 'mean'):
         found = []
@@ -429,11 +492,16 @@ def test_sigma_of_gravity_at_rest_under_acceleration_and_after_braking():
 def test_gravity_follows_with_its_time_constant(constant):
     """The measured direction jumps by 1 deg: 1 - 1/e of it is left behind after the constant."""
     aside = 9.80665 * np.tan(np.radians(1.0))
-    buffer, end = run(acceleration=lambda t: np.outer(t > 4.0 * constant, [aside, 0.0, 0.0]),
-                      seconds=5.0 * constant, noise=0.0, gyro_bias_sigma=0.0,
-                      gravity_time_constant=constant)
+    buffer, end = run(
+        acceleration=lambda t: np.outer(t > 4.0 * constant, [aside, 0.0, 0.0]),
+        seconds=5.0 * constant,
+        noise=0.0,
+        gyro_bias_sigma=0.0,
+        gravity_time_constant=constant,
+    )
     assert direction_error(buffer.gravity(end).direction, -UP) == pytest.approx(
-        1.0 - np.exp(-1.0), abs=0.01)
+        1.0 - np.exp(-1.0), abs=0.01
+    )
 
 
 def test_a_gap_ends_the_propagation_by_the_gyro():
@@ -470,8 +538,12 @@ def test_sigma_holds_under_random_acceleration():
         keep = np.exp(-0.005 / 0.2)
         drive = np.sqrt(1.0 - keep**2) * rng.normal(size=(1600, 3))
         acceleration = lfilter([1.0], [1.0, -keep], drive, axis=0)
-        buffer, end = run(acceleration=lambda times, found=acceleration: found, seconds=8.0,
-                          bias=3e-3 * rng.normal(size=3), noise=0.0)
+        buffer, end = run(
+            acceleration=lambda times, found=acceleration: found,
+            seconds=8.0,
+            bias=3e-3 * rng.normal(size=3),
+            noise=0.0,
+        )
         estimate = buffer.gravity(end)
         normalised.append(np.radians(direction_error(estimate.direction, -UP)) / estimate.sigma)
     normalised = np.array(normalised)
@@ -483,10 +555,13 @@ def test_sigma_holds_under_random_acceleration():
 @FILTERS
 def test_gravity_is_causal_and_independent_of_pruning(gravity_filter):
     rng = np.random.default_rng(8)
-    items = samples(PERIOD * np.arange(1500), rng.normal(size=(1500, 3)),
-                    rng.normal(size=(1500, 3)) + UP)
-    kept, early = (filled(items[:count], gravity_filter=gravity_filter, imu_buffer_seconds=60.0)
-                   for count in (1500, 1301))
+    items = samples(
+        PERIOD * np.arange(1500), rng.normal(size=(1500, 3)), rng.normal(size=(1500, 3)) + UP
+    )
+    kept, early = (
+        filled(items[:count], gravity_filter=gravity_filter, imu_buffer_seconds=60.0)
+        for count in (1500, 1301)
+    )
     pruned = ImuBuffer(ImuConfig(gravity_filter=gravity_filter))
     for k, item in enumerate(items):
         pruned.add(item)
@@ -510,7 +585,7 @@ def orientation_of(first, fifth=None, quat=QUAT):
     msg.orientation.x, msg.orientation.y, msg.orientation.z, msg.orientation.w = map(float, quat)
     msg.orientation_covariance[0] = first
     msg.orientation_covariance[4] = first if fifth is None else fifth
-    msg.orientation_covariance[8] = 1e6   # the heading is not used
+    msg.orientation_covariance[8] = 1e6  # the heading is not used
     return imu_sample_from_message(msg).orientation
 
 
@@ -527,26 +602,40 @@ def test_orientation_of_a_message_requires_a_covariance():
 
 def with_orientation(own, force=-9.81 * DOWN, rate=(0.0, 0.0, 0.0), **config):
     """A buffer of 4 s of an IMU at WORLD_IMU, with orientations `own(k)`, and its last time."""
-    buffer = filled([ImuSample(k * PERIOD, tuple(rate), None if force is None else tuple(force),
-                               own(k)) for k in range(800)], **config)
+    buffer = filled(
+        [
+            ImuSample(k * PERIOD, tuple(rate), None if force is None else tuple(force), own(k))
+            for k in range(800)
+        ],
+        **config,
+    )
     return buffer, 798 * PERIOD + 2_000_000
 
 
 def off(degrees):
     """Down with an error."""
     axis = np.cross(DOWN, [1.0, 0.0, 0.0])
-    return tuple(Rotation.from_rotvec(
-        np.radians(degrees) * axis / np.linalg.norm(axis)).apply(DOWN))
+    return tuple(
+        Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).apply(DOWN)
+    )
 
 
 @FILTERS
-@pytest.mark.parametrize(('own', 'used', 'expected'), [
-    (off(1.0), True, off(1.0)), (off(1.0), False, DOWN),
-    # North-east-down, another start, the identity: each of another world.
-    (off(180.0), True, DOWN), (off(60.0), True, DOWN), ((0.0, 0.0, -1.0), True, DOWN)])
+@pytest.mark.parametrize(
+    ('own', 'used', 'expected'),
+    [
+        (off(1.0), True, off(1.0)),
+        (off(1.0), False, DOWN),
+        # North-east-down, another start, the identity: each of another world.
+        (off(180.0), True, DOWN),
+        (off(60.0), True, DOWN),
+        ((0.0, 0.0, -1.0), True, DOWN),
+    ],
+)
 def test_an_orientation_that_agrees_is_used(gravity_filter, own, used, expected):
-    buffer, at = with_orientation(lambda k: (*own, 0.02),
-                                  gravity_filter=gravity_filter, use_imu_orientation=used)
+    buffer, at = with_orientation(
+        lambda k: (*own, 0.02), gravity_filter=gravity_filter, use_imu_orientation=used
+    )
     estimate = buffer.gravity(at)
     np.testing.assert_allclose(estimate.direction, expected, atol=1e-9)
     assert (estimate.sigma == 0.02) == (expected is not DOWN)
@@ -555,17 +644,20 @@ def test_an_orientation_that_agrees_is_used(gravity_filter, own, used, expected)
 def test_without_an_accelerometer_the_orientation_is_used():
     buffer, at = with_orientation(lambda k: (*DOWN, 1e-6), None)
     np.testing.assert_allclose(buffer.gravity(at).direction, DOWN, atol=1e-9)
-    assert buffer.gravity(at).sigma == 0.01   # the least of an orientation
+    assert buffer.gravity(at).sigma == 0.01  # the least of an orientation
 
 
 @FILTERS
 def test_orientation_is_propagated_by_the_gyro_and_dropped_when_old(gravity_filter):
     rate = np.array([0.0, 1.0, 0.0])
     found = []
-    for only in (790, 780):   # 780 is older than a gap (0.05 s)
+    for only in (790, 780):  # 780 is older than a gap (0.05 s)
         buffer, at = with_orientation(
             lambda k, only=only: (*DOWN, 0.02) if k == only else None,
-            force=None, rate=rate, gravity_filter=gravity_filter)
+            force=None,
+            rate=rate,
+            gravity_filter=gravity_filter,
+        )
         found.append(buffer.gravity(at))
     expected = Rotation.from_rotvec(-(at - 790 * PERIOD) * 1e-9 * rate).apply(DOWN)
     np.testing.assert_allclose(found[0].direction, expected, atol=1e-9)
@@ -575,14 +667,20 @@ def test_orientation_is_propagated_by_the_gyro_and_dropped_when_old(gravity_filt
 # -- Preintegrated acceleration -------------------------------------------------------------------
 
 ARM = np.array([0.12, -0.05, 0.08])
-EXACT = ImuConfig(accel_noise_density=1e-6, accel_bias_sigma=0.0, imu_position_sigma=0.0,
-                  gyro_noise_density=1e-7, gyro_bias_sigma=0.0)
+EXACT = ImuConfig(
+    accel_noise_density=1e-6,
+    accel_bias_sigma=0.0,
+    imu_position_sigma=0.0,
+    gyro_noise_density=1e-7,
+    gyro_bias_sigma=0.0,
+)
 
 
 @pytest.fixture(scope='module')
 def walk():
-    return hand_held(np.random.default_rng(3), -0.5, 4.0, Plan.parse('walk:3.0'), speed=1.5,
-                     rotation_rate=0.8)
+    return hand_held(
+        np.random.default_rng(3), -0.5, 4.0, Plan.parse('walk:3.0'), speed=1.5, rotation_rate=0.8
+    )
 
 
 def samples_of(walk, first, last, rate):
@@ -604,8 +702,12 @@ def imu_states(walk, times):
 def true_motion(walk, begin, duration):
     """(alpha, beta) of the IMU, in the axes of the camera at `begin`."""
     position, velocity, R = imu_states(walk, [begin, begin + duration])
-    return np.concatenate([R[0].T @ (position[1] - position[0] - duration * velocity[0]),
-                           R[0].T @ (velocity[1] - velocity[0])])
+    return np.concatenate(
+        [
+            R[0].T @ (position[1] - position[0] - duration * velocity[0]),
+            R[0].T @ (velocity[1] - velocity[0]),
+        ]
+    )
 
 
 def integrals(motion):
@@ -615,39 +717,61 @@ def integrals(motion):
 def preintegrated(walk, begin, duration, rate):
     """From exact samples, with gravity as it is."""
     R1 = walk.states([begin]).R_world_cam[0]
-    return integration.preintegrate(*samples_of(walk, begin, begin + duration, rate),
-                                    R1.T @ GRAVITY, np.zeros((3, 3)), ARM, EXACT, 0.0)
+    return integration.preintegrate(
+        *samples_of(walk, begin, begin + duration, rate),
+        R1.T @ GRAVITY,
+        np.zeros((3, 3)),
+        ARM,
+        EXACT,
+        0.0,
+    )
 
 
-@pytest.mark.parametrize(('duration', 'rate', 'tolerance'), [
-    (0.15, 4000.0, 1e-6), (0.5, 4000.0, 1e-6), (0.15, 200.0, 1e-3), (0.5, 200.0, 2e-3)])
+@pytest.mark.parametrize(
+    ('duration', 'rate', 'tolerance'),
+    [(0.15, 4000.0, 1e-6), (0.5, 4000.0, 1e-6), (0.15, 200.0, 1e-3), (0.5, 200.0, 2e-3)],
+)
 def test_positions_and_velocities_of_a_walk(walk, duration, rate, tolerance):
     for begin in (0.2, 0.9, 1.7, 2.4):
         motion = preintegrated(walk, begin, duration, rate)
         assert motion.duration == pytest.approx(duration)
-        np.testing.assert_allclose(integrals(motion), true_motion(walk, begin, duration),
-                                   atol=tolerance)
-        assert np.linalg.norm(motion.beta) > 0.05   # it does accelerate
+        np.testing.assert_allclose(
+            integrals(motion), true_motion(walk, begin, duration), atol=tolerance
+        )
+        assert np.linalg.norm(motion.beta) > 0.05  # it does accelerate
 
 
 def test_the_velocities_of_the_camera_follow_from_the_baseline(walk):
     """At the truth b (d - c t) + a vanishes: lever arm, rows and units are right."""
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                                  readout_time=0.03, reference_row='first')
+    camera = RollingShutterCamera(
+        width=640,
+        height=480,
+        fx=450.0,
+        fy=450.0,
+        cx=319.5,
+        cy=239.5,
+        readout_time=0.03,
+        reference_row='first',
+    )
     begin, duration, half = 1.1, 0.2, 0.5 * 0.03 * 479 / 480
     states = walk.states([begin, begin + duration, begin + half, begin + duration + half])
     R1, R2 = states.R_world_cam[:2]
     # The acceleration within the frames is that of the IMU, not of the camera.
     change = imu_states(walk, begin + np.array([0.0, half, duration, duration + half]))[1]
-    motion = replace(preintegrated(walk, begin, duration, 4000.0),
-                     acceleration1=R1.T @ (change[1] - change[0]) / half,
-                     acceleration2=R1.T @ (change[3] - change[2]) / half)
+    motion = replace(
+        preintegrated(walk, begin, duration, 4000.0),
+        acceleration1=R1.T @ (change[1] - change[0]) / half,
+        acceleration2=R1.T @ (change[3] - change[2]) / half,
+    )
     rows = np.linspace(-1e-3, 0.031, 65)
     # With the rate at the middle row, as the truth.
     frames = [
-        replace(FrameMotion.from_gyro(rows, walk.states(rows + at).angular_velocity),
-                angular_velocity=w)
-        for at, w in zip((begin, begin + duration), states.angular_velocity[2:], strict=True)]
+        replace(
+            FrameMotion.from_gyro(rows, walk.states(rows + at).angular_velocity),
+            angular_velocity=w,
+        )
+        for at, w in zip((begin, begin + duration), states.angular_velocity[2:], strict=True)
+    ]
     points = np.array([[100.0, 100.0], [300.0, 200.0]])
     problem = build_problem(points, points, camera, *frames, R1.T @ R2, 1e-8 * np.eye(3))
     prior, _ = expected_velocities(problem, 'hand_held', duration, motion)
@@ -665,36 +789,58 @@ def test_covariance_holds_for_drawn_errors(walk):
     """Noise, biases, gravity and lever arm drawn as configured: NEES of (alpha, beta) is 6."""
     rng = np.random.default_rng(5)
     begin, duration, rate = 0.8, 0.3, 400.0
-    config = ImuConfig(accel_noise_density=0.02, accel_bias_sigma=0.05, imu_position_sigma=0.02,
-                       gyro_noise_density=2e-3)
+    config = ImuConfig(
+        accel_noise_density=0.02,
+        accel_bias_sigma=0.05,
+        imu_position_sigma=0.02,
+        gyro_noise_density=2e-3,
+    )
     bias_sigma, tilt, length = 0.01, 0.02, 0.1
     times, gyro, force = samples_of(walk, begin, begin + duration, rate)
     R1, R2 = walk.states([begin, begin + duration]).R_world_cam
     gravity = R1.T @ GRAVITY
     down = gravity / np.linalg.norm(gravity)
-    spread = (9.80665 * tilt) ** 2 * (np.eye(3) - np.outer(down, down)) \
-        + length**2 * np.outer(down, down)
+    spread = (9.80665 * tilt) ** 2 * (np.eye(3) - np.outer(down, down)) + length**2 * np.outer(
+        down, down
+    )
 
-    def arm_term(arm):   # of the relation to the camera, in (alpha', beta')
+    def arm_term(arm):  # of the relation to the camera, in (alpha', beta')
         w1, w2 = np.cross(gyro[0], arm), np.cross(gyro[-1], arm)
         return np.concatenate([duration * w1 + arm - R1.T @ R2 @ arm, w1 - R1.T @ R2 @ w2])
 
     exact = integration.preintegrate(times, gyro, force, gravity, spread, ARM, config, bias_sigma)
     errors = []
     for _ in range(600):
-        noisy_gyro = gyro + bias_sigma * rng.normal(size=3) \
+        noisy_gyro = (
+            gyro
+            + bias_sigma * rng.normal(size=3)
             + config.gyro_noise_density * np.sqrt(rate) * rng.normal(size=gyro.shape)
-        noisy_force = force + config.accel_bias_sigma * rng.normal(size=3) \
+        )
+        noisy_force = (
+            force
+            + config.accel_bias_sigma * rng.normal(size=3)
             + config.accel_noise_density * np.sqrt(rate) * rng.normal(size=force.shape)
+        )
         drawn = integration.preintegrate(
-            times, noisy_gyro, noisy_force, rng.multivariate_normal(gravity, spread),
-            np.zeros((3, 3)), ARM, config, bias_sigma)
-        errors.append(integrals(drawn) - integrals(exact)
-                      + arm_term(config.imu_position_sigma * rng.normal(size=3)))
+            times,
+            noisy_gyro,
+            noisy_force,
+            rng.multivariate_normal(gravity, spread),
+            np.zeros((3, 3)),
+            ARM,
+            config,
+            bias_sigma,
+        )
+        errors.append(
+            integrals(drawn)
+            - integrals(exact)
+            + arm_term(config.imu_position_sigma * rng.normal(size=3))
+        )
     errors = np.array(errors)
     sampled, sigma = np.cov(errors.T), np.sqrt(np.diag(exact.covariance))
-    np.testing.assert_allclose(sampled / np.outer(sigma, sigma),
-                               exact.covariance / np.outer(sigma, sigma), atol=0.15)
+    np.testing.assert_allclose(
+        sampled / np.outer(sigma, sigma), exact.covariance / np.outer(sigma, sigma), atol=0.15
+    )
     nees = np.einsum('ki,ij,kj->k', errors, np.linalg.inv(exact.covariance), errors)
     assert np.mean(nees) == pytest.approx(6.0, abs=0.6)
 
@@ -703,12 +849,18 @@ def test_shifted_rows(walk):
     """Between rows 12 ms later: as integrated there."""
     begin, duration, delay = 0.7, 0.2, 0.012
     _, velocity, (R1, M1, *_) = imu_states(
-        walk, [begin, begin + delay, begin + duration, begin + duration + delay])
+        walk, [begin, begin + delay, begin + duration, begin + duration + delay]
+    )
     start = true_motion(walk, begin, duration)
     motion = InertialMotion(
-        start[:3], start[3:], duration, 1e-6 * np.eye(6), ARM,
+        start[:3],
+        start[3:],
+        duration,
+        1e-6 * np.eye(6),
+        ARM,
         acceleration1=R1.T @ (velocity[1] - velocity[0]) / delay,
-        acceleration2=R1.T @ (velocity[3] - velocity[2]) / delay)
+        acceleration2=R1.T @ (velocity[3] - velocity[2]) / delay,
+    )
     later = motion.shifted(delay, R1.T @ M1)
     expected = true_motion(walk, begin + delay, duration)
     np.testing.assert_allclose(later.beta, expected[3:], atol=1e-9)
@@ -736,13 +888,20 @@ def motion_of_frames(walk, change=lambda time, force: force, own_topic=False):
             buffer.add(ImuSample(stamp_ns + late_ns, None, specific))
         buffer.add(ImuSample(stamp_ns, tuple(gyro[k]), None if own_topic else specific))
     stamps = [START + round(at * 1e9) for at in FRAMES]
-    first, *later = (frame_imu(buffer, (stamp, stamp + READOUT_NS), stamp, R_CAM_IMU, previous)
-                     for stamp, previous in zip(stamps, [None, *stamps], strict=False))
+    first, *later = (
+        frame_imu(buffer, (stamp, stamp + READOUT_NS), stamp, R_CAM_IMU, previous)
+        for stamp, previous in zip(stamps, [None, *stamps], strict=False)
+    )
     for frame in later:
         if isinstance(frame.force, str):
             return frame.force
-    gyro, forces = (reduce(lambda a, b: a.joined(b), segments) for segments in (
-        [frame.since_previous for frame in later], [f.force.since_previous for f in later]))
+    gyro, forces = (
+        reduce(lambda a, b: a.joined(b), segments)
+        for segments in (
+            [frame.since_previous for frame in later],
+            [f.force.since_previous for f in later],
+        )
+    )
     return integration.inertial_motion(gyro, forces, first, later[-1], config)
 
 
@@ -757,12 +916,16 @@ def test_motion_from_the_frames_of_a_pair(walk, own_topic):
     assert np.abs(error[3:]).max() < 0.25
 
 
-@pytest.mark.parametrize(('change', 'reason'), [
-    (lambda time, force: None, 'there is no accelerometer'),
-    (lambda time, force: force / 9.80665, 'must be specific force in m/s'),
-    (lambda time, force: force * 100.0, 'must be specific force in m/s'),
-    (lambda time, force: np.clip(force + 30.0 * (1.25 < time < 1.28), -19.6, 19.6), 'clipped'),
-    (lambda time, force: None if 1.24 < time < 1.31 else force, 'gap')])
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        (lambda time, force: None, 'there is no accelerometer'),
+        (lambda time, force: force / 9.80665, 'must be specific force in m/s'),
+        (lambda time, force: force * 100.0, 'must be specific force in m/s'),
+        (lambda time, force: np.clip(force + 30.0 * (1.25 < time < 1.28), -19.6, 19.6), 'clipped'),
+        (lambda time, force: None if 1.24 < time < 1.31 else force, 'gap'),
+    ],
+)
 def test_an_unusable_accelerometer(walk, change, reason):
     found = motion_of_frames(walk, change)
     assert isinstance(found, str)
@@ -771,7 +934,9 @@ def test_an_unusable_accelerometer(walk, change, reason):
 
 def test_scale_of_the_accelerometer_drops_out_of_gravity(walk):
     """A sensor with 3 % too much: gravity is used as measured."""
-    right, scaled = (motion_of_frames(walk, lambda time, force, scale=scale: scale * force)
-                     for scale in (1.0, 1.03))
+    right, scaled = (
+        motion_of_frames(walk, lambda time, force, scale=scale: scale * force)
+        for scale in (1.0, 1.03)
+    )
     difference = np.linalg.norm(scaled.beta - right.beta) / right.duration
-    assert difference < 0.16   # 0.29 m/s^2 of gravity alone otherwise
+    assert difference < 0.16  # 0.29 m/s^2 of gravity alone otherwise

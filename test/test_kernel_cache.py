@@ -72,17 +72,35 @@ def package(built: Path, tmp_path: Path) -> Path:
 
 def run(package: Path, how: str = 'writable', **environment: str) -> list[float]:
     """Results of the two kernels, how many were loaded, how many compiled."""
-    clean = {key: value for key, value in os.environ.items()
-             if not key.startswith(('NUMBA_', 'XDG_'))}
-    return json.loads(output(PROGRAM, how, cwd=package, env={
-        **clean, 'HOME': str(package.parent / 'home'), **environment}))
+    clean = {
+        key: value for key, value in os.environ.items() if not key.startswith(('NUMBA_', 'XDG_'))
+    }
+    return json.loads(
+        output(
+            PROGRAM,
+            how,
+            cwd=package,
+            env={**clean, 'HOME': str(package.parent / 'home'), **environment},
+        )
+    )
 
 
-def output(program: str, *arguments: str, cwd: Path, env: dict[str, str] | None = None,
-           timeout: float = 110) -> str:
-    return subprocess.run([sys.executable, '-B', '-W', 'error', '-c', program, *arguments],
-                          cwd=cwd, env=env, check=True, text=True, stdout=subprocess.PIPE,
-                          timeout=timeout).stdout
+def output(
+    program: str,
+    *arguments: str,
+    cwd: Path,
+    env: dict[str, str] | None = None,
+    timeout: float = 110,
+) -> str:
+    return subprocess.run(
+        [sys.executable, '-B', '-W', 'error', '-c', program, *arguments],
+        cwd=cwd,
+        env=env,
+        check=True,
+        text=True,
+        stdout=subprocess.PIPE,
+        timeout=timeout,
+    ).stdout
 
 
 def files(folder: Path) -> dict[str, int]:
@@ -98,9 +116,13 @@ def test_an_index_of_a_class_that_was_renamed_is_not_read(package):
     """Numba would unpickle it, by the name of the class."""
     inner = package / NAME / 'inner.py'
     for name, starts in (('Before', 1), ('After', 2)):
-        inner.write_text(INNER.replace('@kernel', f'from typing import NamedTuple\n\nclass {name}'
-                                       '(NamedTuple):\n    x: float\n\n@kernel').replace(
-            '2.0 * x', '2.0 * x[0]'))
+        inner.write_text(
+            INNER.replace(
+                '@kernel',
+                f'from typing import NamedTuple\n\nclass {name}'
+                '(NamedTuple):\n    x: float\n\n@kernel',
+            ).replace('2.0 * x', '2.0 * x[0]')
+        )
         called = f'from rs_relpose_ros.inner import *; print(inner({name}(3.0)))'
         for _ in range(starts):
             assert output(called, cwd=package) == '6.0\n'
@@ -128,8 +150,15 @@ def test_a_read_only_package_is_copied_for_its_user(package, tmp_path):
 def test_a_user_without_a_home(package, tmp_path):
     (tmp_path / 'file').touch()
     (tmp_path / 'tmp').mkdir()
-    assert run(package, 'read-only', HOME=str(tmp_path / 'file' / 'home'),
-               TMPDIR=str(tmp_path / 'tmp')) == HITS
+    assert (
+        run(
+            package,
+            'read-only',
+            HOME=str(tmp_path / 'file' / 'home'),
+            TMPDIR=str(tmp_path / 'tmp'),
+        )
+        == HITS
+    )
 
 
 def test_without_private_parts_of_numba(package):
@@ -148,13 +177,15 @@ def test_this_numba_was_tried():
 
 def test_every_import_of_a_kernels_module_counts(monkeypatch):
     """What `source_digest` finds by a pattern is what the parser finds."""
+
     @functools.cache
     def reached(module: str) -> set[str]:
         found = {module_behind(name) for name in imports(MODULES[module])} - {''}
         return found.union(*map(reached, found))
 
-    with_kernels = [name for name, path in MODULES.items()
-                    if 'rs_relpose_ros.jit import' in path.read_text()]
+    with_kernels = [
+        name for name, path in MODULES.items() if 'rs_relpose_ros.jit import' in path.read_text()
+    ]
     assert len(with_kernels) > 20
     read_bytes, read = Path.read_bytes, set()
     monkeypatch.setattr(Path, 'read_bytes', lambda path: (read.add(path), read_bytes(path))[1])
@@ -205,8 +236,9 @@ print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
 
 @pytest.mark.timeout(600)
 def test_nothing_is_compiled_after_the_warm_up(bundled_bag):
-    statuses, compiled_late, kernels = json.loads(output(
-        WARM_UP, str(bundled_bag), str(BUNDLED_PARAMETERS), cwd=ROOT, timeout=590))
+    statuses, compiled_late, kernels = json.loads(
+        output(WARM_UP, str(bundled_bag), str(BUNDLED_PARAMETERS), cwd=ROOT, timeout=590)
+    )
     # The bag holds motion, standstill and pure rotation: every path of the estimator.
     assert {'OK', 'PURE_ROTATION'} <= set(statuses)
     assert kernels > 5

@@ -42,8 +42,16 @@ QUATERNION = (0.0, 0.0, 0.0, 1.0)
 CAMERA = CameraId('a/b:c', 320, 240)
 TEXT = '/**:\n  ros__parameters:\n    readout_time: 0.02\n    readout_time_sigma: 0.001\n'
 TRUTH = SimulationConfig(
-    duration=8.0, width=320, height=240, fx=225.0, edge_samples=1, plan='walk:8',
-    readout_time=0.02, time_offset=0.03, seed=5)
+    duration=8.0,
+    width=320,
+    height=240,
+    fx=225.0,
+    edge_samples=1,
+    plan='walk:8',
+    readout_time=0.02,
+    time_offset=0.03,
+    seed=5,
+)
 
 
 @pytest.fixture(scope='module')
@@ -54,6 +62,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # -- the file ------------------------------------------------------------------------------------
+
 
 def test_a_stored_calibration_is_of_its_camera_only(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
@@ -82,9 +91,12 @@ def test_a_typo_in_an_edited_file_is_named(tmp_path):
     path = tmp_path / 'file.yaml'
     stored.save(path, CAMERA, TEXT)
     good = path.read_text()
-    for old, new, named in (('readout_time:', 'readout_tim:', 'did you mean readout_time'),
-                            ('0.02', "'fast'", 'readout_time must be'), (':', '', 'YAML'),
-                            ('  ros__parameters:', '  parameters:', 'ros__parameters')):
+    for old, new, named in (
+        ('readout_time:', 'readout_tim:', 'did you mean readout_time'),
+        ('0.02', "'fast'", 'readout_time must be'),
+        (':', '', 'YAML'),
+        ('  ros__parameters:', '  parameters:', 'ros__parameters'),
+    ):
         path.write_text(good.replace(old, new, 1))
         with pytest.raises(InputError, match=named) as error:
             stored.load(path, CAMERA)
@@ -101,12 +113,13 @@ def test_two_cameras_of_one_frame_id_do_not_share_a_file(tmp_path):
     assert stored.load(path, left)[0]['readout_time'] == 0.02
     with pytest.raises(InputError, match=r'on /left/image, not on /right/image.*camera_name'):
         stored.load(path, right)
-    assert stored.load(path, CAMERA)   # the user has named it
+    assert stored.load(path, CAMERA)  # the user has named it
 
 
 def test_a_user_without_a_home_directory(monkeypatch, bag):
     def without() -> Path:
         raise RuntimeError('Could not determine home directory.')
+
     monkeypatch.delenv('ROS_HOME', raising=False)
     monkeypatch.setattr(Path, 'home', without)
     calibration = LiveCalibration(Parameters(), use_stored=True)
@@ -123,8 +136,10 @@ def test_a_user_without_a_home_directory(monkeypatch, bag):
 
 # -- without ROS ---------------------------------------------------------------------------------
 
-def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True,
-             images: int = 1000) -> Iterator[Any]:
+
+def outcomes(
+    bag: Path, calibration: LiveCalibration, *, moving: bool = True, images: int = 1000
+) -> Iterator[Any]:
     """Outcomes of the messages, the fits awaited; not `moving`: of the first image and a gyro."""
     first: Any = None
     with open_bag(bag) as opened:
@@ -154,22 +169,26 @@ def calibration() -> Iterator[LiveCalibration]:
 def is_near_the_truth(parameters: str) -> bool:
     values = text_values(parameters, 'text')
     turn = Rotation.from_quat(values['quat_cam_imu_xyzw']).as_matrix() @ TRUTH.R_cam_imu.T
-    return (abs(values['readout_time'] - 0.02) < 4.0 * values['readout_time_sigma'] < 8e-3
-            and abs(values['time_offset'] - 0.03) < 4.0 * values['time_offset_sigma'] < 8e-3
-            and Rotation.from_matrix(turn).magnitude() < 0.03)
+    return (
+        abs(values['readout_time'] - 0.02) < 4.0 * values['readout_time_sigma'] < 8e-3
+        and abs(values['time_offset'] - 0.03) < 4.0 * values['time_offset_sigma'] < 8e-3
+        and Rotation.from_matrix(turn).magnitude() < 0.03
+    )
 
 
 def test_a_recording_that_is_too_short_counts_when_it_is_looped(bag, calibration, monkeypatch):
     """The stamps begin again, and so does a clock that is set back."""
     monkeypatch.setattr(live, '_SILENCE', 0.0)
-    assert not any(isinstance(outcome, Calibrated)
-                   for outcome in outcomes(bag, calibration, images=120))
+    assert not any(
+        isinstance(outcome, Calibrated) for outcome in outcomes(bag, calibration, images=120)
+    )
     short = calibration.step()
     assert 'after 4.0 s, too short' in short.text
     assert calibration.step() is None
     found = list(outcomes(bag, calibration, images=120))
-    assert is_near_the_truth(next(
-        outcome.parameters for outcome in found if isinstance(outcome, Calibrated)))
+    assert is_near_the_truth(
+        next(outcome.parameters for outcome in found if isinstance(outcome, Calibrated))
+    )
 
 
 def test_images_that_come_too_fast_are_counted(bag, calibration):
@@ -184,16 +203,19 @@ def test_images_that_come_too_fast_are_counted(bag, calibration):
 
 
 def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag, calibration):
-    found = [outcome for outcome in outcomes(bag, calibration, moving=False)
-             if outcome is not None]
+    found = [
+        outcome for outcome in outcomes(bag, calibration, moving=False) if outcome is not None
+    ]
     assert {type(outcome) for outcome in found} == {Progress}
     assert 'about all three axes' in found[-1].text
 
 
 # -- the node ------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize('given', [{}, {'readout_time': 0.02,
-                                        'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}])
+
+@pytest.mark.parametrize(
+    'given', [{}, {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}]
+)
 def test_a_file_that_lacks_a_parameter_is_not_read_again(given):
     """Edited by hand: the node calibrates, in place of reading it once a second."""
     node = MagicMock(calibrates=True)
@@ -203,20 +225,27 @@ def test_a_file_that_lacks_a_parameter_is_not_read_again(given):
     assert node._warn.called == (not given)
 
 
-KNOWN = {'readout_time': 0.02, 'quat_cam_imu_xyzw': tuple(
-    Rotation.from_matrix(TRUTH.R_cam_imu).as_quat())}
+KNOWN = {
+    'readout_time': 0.02,
+    'quat_cam_imu_xyzw': tuple(Rotation.from_matrix(TRUTH.R_cam_imu).as_quat()),
+}
 
 
-@pytest.mark.parametrize(('given', 'frames', 'turn', 'adopted', 'warned'), [
-    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
-    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),
-    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'other'}, 0.02, False, False),
-    (KNOWN, {Role.IMAGE: 'same', Role.IMU: 'same'}, 0.02, False, False),
-    (KNOWN, {Role.IMAGE: 'camera'}, 0.02, False, False),
-    ({'readout_time': 0.02}, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, True, False)])
+@pytest.mark.parametrize(
+    ('given', 'frames', 'turn', 'adopted', 'warned'),
+    [
+        (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
+        (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),
+        (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'other'}, 0.02, False, False),
+        (KNOWN, {Role.IMAGE: 'same', Role.IMU: 'same'}, 0.02, False, False),
+        (KNOWN, {Role.IMAGE: 'camera'}, 0.02, False, False),
+        ({'readout_time': 0.02}, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, True, False),
+    ],
+)
 def test_extrinsics_are_those_of_tf(given, frames, turn, adopted, warned):
-    quaternion = (Rotation.from_rotvec([0.0, turn, 0.0])
-                  * Rotation.from_matrix(TRUTH.R_cam_imu)).as_quat()
+    quaternion = (
+        Rotation.from_rotvec([0.0, turn, 0.0]) * Rotation.from_matrix(TRUTH.R_cam_imu)
+    ).as_quat()
     known = {('camera', 'imu'): (0.1, 0.2, 0.3, *quaternion), ('same', 'same'): (0.0,) * 7}
     node = MagicMock(_lookup=lambda parent, child: known.get((parent, child)), _calibration=None)
     node._settings.current = Parameters.from_mapping(given)
@@ -232,8 +261,9 @@ def test_extrinsics_are_those_of_tf(given, frames, turn, adopted, warned):
 
 def test_a_calibration_starts_from_the_rotation_of_tf():
     """It is used as it is only where nothing else is missing, or to be calibrated."""
-    node = MagicMock(_lookup=lambda parent, child: (0.1, 0.2, 0.3, *QUATERNION),
-                     _waits_for_tf=lambda: False)
+    node = MagicMock(
+        _lookup=lambda parent, child: (0.1, 0.2, 0.3, *QUATERNION), _waits_for_tf=lambda: False
+    )
     node._settings.current = Parameters()
     SensorNode._use_transform(node, {Role.IMAGE: 'camera', Role.IMU: 'imu'})
     assert node._calibration.quat_prior == node._quat_prior == QUATERNION
@@ -242,13 +272,17 @@ def test_a_calibration_starts_from_the_rotation_of_tf():
 
 @pytest.mark.live
 def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
-        ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    ros_domain_id, bundled_bag, tmp_path, monkeypatch
+):
     """tf2_ros is in no wheel: a stand-in that knows the transform once a file exists."""
-    values = ' '.join(map(str, (0.1, 0.2, 0.3, *read_parameters(
-        BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw)))
+    values = ' '.join(
+        map(str, (0.1, 0.2, 0.3, *read_parameters(BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw))
+    )
     (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv(
+        'PYTHONPATH',
+        os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]),
+    )
     monkeypatch.setenv('TF', f'{reader.CAMERA_FRAME} {reader.IMU_FRAME} {values}')
     monkeypatch.setenv('TF_FILE', str(tmp_path / 'tf'))
     messages = faults.read_messages(bundled_bag, 1.5)
@@ -260,8 +294,9 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
         faults.play(publishers, messages)
         node.wait_for(f'on /tf_static: "{reader.IMU_FRAME}"')
         (tmp_path / 'tf').touch()
-        node.wait_for(f'from /tf_static, {reader.IMU_FRAME} in {reader.CAMERA_FRAME}: quat_cam_imu'
-                      '_xyzw')
+        node.wait_for(
+            f'from /tf_static, {reader.IMU_FRAME} in {reader.CAMERA_FRAME}: quat_cam_imu_xyzw'
+        )
         wait_until(lambda: node.output.count('ready:') == 1, 'a start', node)
         faults.play(publishers, messages, later=100.0)
         wait_until(lambda: poses, 'a pose', node)
@@ -281,7 +316,8 @@ def test_services_that_cannot_be_done_say_why(tmp_path):
     (tmp_path / 'file').touch()
     node._calibrated = Calibrated(CAMERA, TEXT, '')
     node._settings.current = Parameters.from_mapping(
-        {'calibration_file': str(tmp_path / 'file' / 'c.yaml')})
+        {'calibration_file': str(tmp_path / 'file' / 'c.yaml')}
+    )
     assert 'c.yaml' in called(SensorNode._save_now)
     node._cannot_start = 'a rectified image'
     for service in (SensorNode._reset, SensorNode._calibrate_now):
@@ -290,13 +326,17 @@ def test_services_that_cannot_be_done_say_why(tmp_path):
 
 @pytest.mark.live
 def test_two_nodes_of_one_name_and_messages_without_frame_id_are_reported(
-        ros_domain_id, bundled_bag):
+    ros_domain_id, bundled_bag
+):
     messages = faults.read_messages(bundled_bag, 1.0)
     for _, message in messages:
         message.header.frame_id = ''
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS,
-            parameters={'image_transport': 'raw'}) as node:
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS, parameters={'image_transport': 'raw'}
+        ) as node,
+    ):
         node.wait_for('ready')
         assert 'another node' not in node.output
         faults.play(faults.drivers(graph), messages)
@@ -308,11 +348,13 @@ def test_two_nodes_of_one_name_and_messages_without_frame_id_are_reported(
 
 @pytest.mark.live
 def test_other_nodes_take_the_published_calibration(ros_domain_id):
-    text = (TEXT + '    quat_cam_imu_xyzw: [0.0, 0.0, 0.0, 1.0]\n    axes_sigma: 0.01\n')
+    text = TEXT + '    quat_cam_imu_xyzw: [0.0, 0.0, 0.0, 1.0]\n    axes_sigma: 0.01\n'
     topic = '/relpose_node/calibration'
-    with Graph() as graph, node_process(
-            node='odometry_node', remap={'calibration': topic}) as odometry, node_process(
-            node='global_shutter_node', remap={'calibration': topic}) as global_shutter:
+    with (
+        Graph() as graph,
+        node_process(node='odometry_node', remap={'calibration': topic}) as odometry,
+        node_process(node='global_shutter_node', remap={'calibration': topic}) as global_shutter,
+    ):
         nodes = odometry, global_shutter
         for node in nodes:
             node.wait_for('waiting for')
@@ -326,16 +368,21 @@ def test_other_nodes_take_the_published_calibration(ros_domain_id):
 @pytest.mark.timeout(600)
 def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    start = {'parameters': {'image_transport': 'compressed',
-                            **faults.reliable(reader.COMPRESSED_TOPIC, reader.IMU_TOPIC)},
-             'remap': faults.BAG_TOPICS}
+    start = {
+        'parameters': {
+            'image_transport': 'compressed',
+            **faults.reliable(reader.COMPRESSED_TOPIC, reader.IMU_TOPIC),
+        },
+        'remap': faults.BAG_TOPICS,
+    }
     path = tmp_path / 'rs_relpose' / 'camera_optical_frame_320x240.yaml'
     with Graph() as graph:
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         published: list[String] = []
         graph.node.create_subscription(
-            String, '/relpose_node/calibration', published.append, LATCHED)
+            String, '/relpose_node/calibration', published.append, LATCHED
+        )
         with node_process(**start) as node:
             node.wait_for('waiting for the first image')
             with player_process(bag) as playing:
@@ -358,13 +405,19 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
             with player_process(bag):
                 node.wait_for('using the calibration of')
             node.wait_for('ready')
-            request = SetParameters.Request(parameters=[
-                Parameter('readout_time', value=value).to_parameter_msg()
-                for value in (0.0201, 0.0202)])   # the second while the kernels are loaded
-            assert graph.call(SetParameters, '/relpose_node/set_parameters',
-                              request).results[1].successful
+            request = SetParameters.Request(
+                parameters=[
+                    Parameter('readout_time', value=value).to_parameter_msg()
+                    for value in (0.0201, 0.0202)
+                ]
+            )  # the second while the kernels are loaded
+            assert (
+                graph.call(SetParameters, '/relpose_node/set_parameters', request)
+                .results[1]
+                .successful
+            )
             wait_until(lambda: node.output.count('ready:') > 1, 'a new start', node)
             time.sleep(0.3)
-            assert node.output.count('ready:') == 2   # one timer waits for them
+            assert node.output.count('ready:') == 2  # one timer waits for them
             assert 'Traceback' not in node.output
             node.stop()

@@ -49,7 +49,7 @@ GRAY = np.ascontiguousarray(RGB[:, :, 0])
 def padded(rows: np.ndarray, padding: int) -> tuple[bytes, int]:
     """Bytes of an array of rows with `padding` bytes of garbage after each, and the step."""
     flat = rows.reshape(len(rows), -1).view(np.uint8)
-    filled = np.concatenate([flat, np.full((len(rows), padding), 0xaa, np.uint8)], axis=1)
+    filled = np.concatenate([flat, np.full((len(rows), padding), 0xAA, np.uint8)], axis=1)
     return filled.tobytes(), filled.shape[1]
 
 
@@ -61,14 +61,17 @@ def packed_yuv(luma_at: int) -> tuple[bytes, int]:
 
 # -- images ----------------------------------------------------------------------------------
 
+
 def decoded(message: object) -> np.ndarray:
     return incoming.image_from_message(message).decoded()
 
 
 @build.both_types
 @pytest.mark.parametrize('padding', [0, 3])
-@pytest.mark.parametrize(('encoding', 'order'), [
-    ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
+@pytest.mark.parametrize(
+    ('encoding', 'order'),
+    [('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])],
+)
 def test_color_becomes_luma(types, encoding, order, padding):
     data, step = padded(np.ascontiguousarray(RGB[:, :, order]), padding)
     gray = decoded(build.image(types, 10, 7, encoding, data, step=step))
@@ -77,16 +80,24 @@ def test_color_becomes_luma(types, encoding, order, padding):
 
 
 @build.both_types
-@pytest.mark.parametrize(('encoding', 'data', 'step'), [
-    ('mono8', *padded(GRAY, 0)), ('mono8', *padded(GRAY, 5)),
-    ('mono8', padded(GRAY, 5)[0][:-5], 15),   # the last row needs no padding
-    # Planar: luma first.
-    *((encoding, GRAY.tobytes() + bytes(35), 10) for encoding in ('nv12', 'nv21', 'i420')),
-    *((encoding, *packed_yuv(luma_at)) for encoding, luma_at in (
-        ('yuv422_yuy2', 0), ('yuyv', 0), ('yuv422', 1), ('uyvy', 1)))])
+@pytest.mark.parametrize(
+    ('encoding', 'data', 'step'),
+    [
+        ('mono8', *padded(GRAY, 0)),
+        ('mono8', *padded(GRAY, 5)),
+        ('mono8', padded(GRAY, 5)[0][:-5], 15),  # the last row needs no padding
+        # Planar: luma first.
+        *((encoding, GRAY.tobytes() + bytes(35), 10) for encoding in ('nv12', 'nv21', 'i420')),
+        *(
+            (encoding, *packed_yuv(luma_at))
+            for encoding, luma_at in (('yuv422_yuy2', 0), ('yuyv', 0), ('yuv422', 1), ('uyvy', 1))
+        ),
+    ],
+)
 def test_luma_is_used_as_it_is(types, encoding, data, step):
     np.testing.assert_array_equal(
-        decoded(build.image(types, 10, 7, encoding, data, step=step)), GRAY)
+        decoded(build.image(types, 10, 7, encoding, data, step=step)), GRAY
+    )
 
 
 @build.both_types
@@ -96,7 +107,8 @@ def test_16_bits_honour_byte_order(types, order, is_bigendian, encoding):
     values = np.arange(0, 60000, 25, dtype=np.uint16).reshape(40, 60)
     data, step = padded(values.astype(order), 2)
     gray = decoded(
-        build.image(types, 60, 40, encoding, data, step=step, is_bigendian=is_bigendian))
+        build.image(types, 60, 40, encoding, data, step=step, is_bigendian=is_bigendian)
+    )
     slope, offset = np.polyfit(values.ravel(), gray.ravel(), 1)
     assert 170 < gray.max() - gray.min() <= 255
     np.testing.assert_allclose(gray, slope * values + offset, atol=1.5)
@@ -106,8 +118,9 @@ def texture(low: float, high: float) -> np.ndarray:
     return np.random.default_rng(3).uniform(low, high, (120, 160)).astype(np.uint16)
 
 
-@pytest.mark.parametrize(('low', 'high'), [
-    (0, 1023), (0, 4095), (100, 16383), (0, 65535), (29_800, 30_400)])
+@pytest.mark.parametrize(
+    ('low', 'high'), [(0, 1023), (0, 4095), (100, 16383), (0, 65535), (29_800, 30_400)]
+)
 def test_16_bits_are_scaled_to_their_content(low, high):
     gray = GrayLevels().gray(texture(low, high))
     assert 120 < int(gray.max()) - int(gray.min()) <= 255
@@ -133,9 +146,12 @@ def test_the_range_of_16_bits_is_kept_while_the_content_fits():
 @build.both_types
 def test_messages_of_16_bits_use_the_given_range(types):
     levels, bright, dark = GrayLevels(), texture(0, 4000), texture(0, 3000)
-    first, second = (incoming.image_from_message(build.image(
-        types, 160, 120, 'mono16', pixels.astype('<u2').tobytes(), step=320)).decoded(levels)
-        for pixels in (bright, dark))
+    first, second = (
+        incoming.image_from_message(
+            build.image(types, 160, 120, 'mono16', pixels.astype('<u2').tobytes(), step=320)
+        ).decoded(levels)
+        for pixels in (bright, dark)
+    )
     assert second.mean() < first.mean() - 20
     png = cv2.imencode('.png', bright)[1].tobytes()
     np.testing.assert_array_equal(decoded(build.compressed(types, png)), first)
@@ -150,24 +166,28 @@ def test_bayer_patterns_have_their_colors(types, pattern, bits):
     tile = np.array([level[c] for c in pattern], dtype=np.uint8).reshape(2, 2)
     mosaic = np.tile(tile, (4, 5))
     raw = mosaic if bits == 8 else mosaic.astype('<u2') * 256
-    gray = decoded(build.image(
-        types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8))
+    gray = decoded(
+        build.image(types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8)
+    )
     luma = WEIGHTS @ [200, 100, 50]
     # Of 16 bits, black and white are a quarter of the range beyond the content.
     expected = luma if bits == 8 else (luma - 12.5) * 255 / 225
     np.testing.assert_allclose(gray[2:-2, 2:-2], expected, atol=1.5)
 
 
-@pytest.mark.parametrize(('change', 'expected'), [
-    ({'encoding': '32FC1'}, "'32FC1' is not known; publish one of mono8"),
-    ({'width': 0}, 'size 0x7'),
-    ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'size .* is not usable'),
-    ({'width': 16384, 'height': 16384, 'step': 16384}, 'size .* is not usable'),
-    ({'width': 8192, 'height': 8192, 'step': 8192}, '70 bytes of data, but 8192x8192'),
-    ({'step': 9}, 'step is 9 bytes, but a row .* has 10'),
-    ({'height': 8}, '70 bytes of data, but 10x8 .* needs 80'),
-    ({'encoding': 'bgr8'}, 'step is 10 bytes, but a row .* has 30'),
-])
+@pytest.mark.parametrize(
+    ('change', 'expected'),
+    [
+        ({'encoding': '32FC1'}, "'32FC1' is not known; publish one of mono8"),
+        ({'width': 0}, 'size 0x7'),
+        ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'size .* is not usable'),
+        ({'width': 16384, 'height': 16384, 'step': 16384}, 'size .* is not usable'),
+        ({'width': 8192, 'height': 8192, 'step': 8192}, '70 bytes of data, but 8192x8192'),
+        ({'step': 9}, 'step is 9 bytes, but a row .* has 10'),
+        ({'height': 8}, '70 bytes of data, but 10x8 .* needs 80'),
+        ({'encoding': 'bgr8'}, 'step is 10 bytes, but a row .* has 30'),
+    ],
+)
 def test_unusable_image_is_refused(change, expected):
     fields = {'width': 10, 'height': 7, 'encoding': 'mono8', 'step': 10, **change}
     with pytest.raises(InputError, match=expected):
@@ -189,27 +209,36 @@ def test_trailing_bytes_and_an_orientation_tag_change_nothing():
 def png_of_size(width: int, height: int) -> bytes:
     chunk = b'IHDR' + struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
     end = b'IEND'
-    return (b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + chunk
-            + struct.pack('>I', zlib.crc32(chunk)) + struct.pack('>I', 0) + end
-            + struct.pack('>I', zlib.crc32(end)))
+    return (
+        b'\x89PNG\r\n\x1a\n'
+        + struct.pack('>I', 13)
+        + chunk
+        + struct.pack('>I', zlib.crc32(chunk))
+        + struct.pack('>I', 0)
+        + end
+        + struct.pack('>I', zlib.crc32(end))
+    )
 
 
 JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8))
 
 
-@pytest.mark.parametrize(('data', 'expected'), [
-    (b'', '0 bytes is neither JPEG nor PNG'),
-    (b'GIF89a' + bytes(100), '106 bytes is neither JPEG nor PNG'),
-    (JPEG[:len(JPEG) // 2], 'is truncated'),
-    (b'\xff\xd8\xff\xd9', 'has no frame header'),
-    (b'\xff\xd8\xff\xe0\x00\x00' + bytes(20) + b'\xff\xd9', 'has no frame header'),
-    (JPEG[:24] + b'\xff\xd9', 'has no frame header'),
-    # Decoded, it would take 1.8 GB.
-    (JPEG.replace(b'\x00\x30\x00\x40', b'\xa8\xca\xa8\xca', 1), 'size 43210x43210'),
-    (png_of_size(2**31 - 1, 2**31 - 1), 'size 2147483647x2147483647'),
-    (png_of_size(64, 48), 'is corrupt'),
-    (png_of_size(64, 48)[:30], 'truncated'),
-])
+@pytest.mark.parametrize(
+    ('data', 'expected'),
+    [
+        (b'', '0 bytes is neither JPEG nor PNG'),
+        (b'GIF89a' + bytes(100), '106 bytes is neither JPEG nor PNG'),
+        (JPEG[: len(JPEG) // 2], 'is truncated'),
+        (b'\xff\xd8\xff\xd9', 'has no frame header'),
+        (b'\xff\xd8\xff\xe0\x00\x00' + bytes(20) + b'\xff\xd9', 'has no frame header'),
+        (JPEG[:24] + b'\xff\xd9', 'has no frame header'),
+        # Decoded, it would take 1.8 GB.
+        (JPEG.replace(b'\x00\x30\x00\x40', b'\xa8\xca\xa8\xca', 1), 'size 43210x43210'),
+        (png_of_size(2**31 - 1, 2**31 - 1), 'size 2147483647x2147483647'),
+        (png_of_size(64, 48), 'is corrupt'),
+        (png_of_size(64, 48)[:30], 'truncated'),
+    ],
+)
 def test_unusable_compressed_image_is_refused(data, expected):
     with pytest.raises(InputError, match=expected):
         decoded(build.compressed(build.rosbags_types, data))
@@ -217,16 +246,28 @@ def test_unusable_compressed_image_is_refused(data, expected):
 
 # -- calibration -----------------------------------------------------------------------------
 
+
 @build.both_types
-@pytest.mark.parametrize(('change', 'size', 'corners'), [
-    ({}, (640, 480), [[0.0, 0.0], [199.0, 149.0]]),
-    # The first published pixel covers sensor pixels 100 and 101: its centre lies between them.
-    ({'roi': (100, 60, 400, 300), 'binning': (2, 2)}, (200, 150),
-     [[100.5, 60.5], [498.5, 358.5]])])
+@pytest.mark.parametrize(
+    ('change', 'size', 'corners'),
+    [
+        ({}, (640, 480), [[0.0, 0.0], [199.0, 149.0]]),
+        # The first published pixel covers sensor pixels 100 and 101: its centre lies between them.
+        (
+            {'roi': (100, 60, 400, 300), 'binning': (2, 2)},
+            (200, 150),
+            [[100.5, 60.5], [498.5, 358.5]],
+        ),
+    ],
+)
 def test_region_and_binning_shift_rows(types, change, size, corners):
     calibration = incoming.intrinsics_from_info(build.camera_info(types, **change))
     assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
-        450.0, 451.0, 319.5, 239.5)
+        450.0,
+        451.0,
+        319.5,
+        239.5,
+    )
     assert (calibration.image_width, calibration.image_height) == size
     points = np.array([[0.0, 0.0], [199.0, 149.0]])
     np.testing.assert_array_equal(calibration.to_sensor(points), corners)
@@ -234,31 +275,43 @@ def test_region_and_binning_shift_rows(types, change, size, corners):
 
 
 @build.both_types
-@pytest.mark.parametrize(('model', 'count'), [
-    ('plumb_bob', 0), ('plumb_bob', 4), ('plumb_bob', 5), ('plumb_bob', 8),
-    ('rational_polynomial', 8), ('equidistant', 4)])
+@pytest.mark.parametrize(
+    ('model', 'count'),
+    [
+        ('plumb_bob', 0),
+        ('plumb_bob', 4),
+        ('plumb_bob', 5),
+        ('plumb_bob', 8),
+        ('rational_polynomial', 8),
+        ('equidistant', 4),
+    ],
+)
 def test_known_distortion(types, model, count):
     coefficients = tuple(0.001 * (i + 1) for i in range(count))
     calibration = incoming.intrinsics_from_info(
-        build.camera_info(types, model=model, d=coefficients))
+        build.camera_info(types, model=model, d=coefficients)
+    )
     assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
 
 
 UNCALIBRATED = {'k': (0.0,) * 9}
 
 
-@pytest.mark.parametrize(('change', 'expected'), [
-    (UNCALIBRATED, 'uncalibrated'),
-    ({'model': 'double_sphere', 'd': (0.1, 0.2)}, "'double_sphere'"),
-    ({'d': (0.1,) * 6}, 'got 6'),
-    ({'d': (float('nan'),) * 5}, 'distortion must be finite'),
-    ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, 'fx must be'),
-    ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, 'must be finite'),
-    ({'k': (450.0, 3.0, 320, 0, 450, 240, 0, 0, 1)}, r'must be \[fx 0 cx'),
-    ({'width': 0}, 'size 0x480'),
-    ({'roi': (400, 0, 400, 300)}, 'leaves the sensor in x'),
-    ({'binning': (1000, 1)}, 'image_width must be >= 1'),
-])
+@pytest.mark.parametrize(
+    ('change', 'expected'),
+    [
+        (UNCALIBRATED, 'uncalibrated'),
+        ({'model': 'double_sphere', 'd': (0.1, 0.2)}, "'double_sphere'"),
+        ({'d': (0.1,) * 6}, 'got 6'),
+        ({'d': (float('nan'),) * 5}, 'distortion must be finite'),
+        ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, 'fx must be'),
+        ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, 'must be finite'),
+        ({'k': (450.0, 3.0, 320, 0, 450, 240, 0, 0, 1)}, r'must be \[fx 0 cx'),
+        ({'width': 0}, 'size 0x480'),
+        ({'roi': (400, 0, 400, 300)}, 'leaves the sensor in x'),
+        ({'binning': (1000, 1)}, 'image_width must be >= 1'),
+    ],
+)
 def test_unusable_calibration_is_refused(change, expected):
     # Only a missing one is replaced by the parameters.
     error = MissingInputError if change is UNCALIBRATED else InputError
@@ -268,31 +321,40 @@ def test_unusable_calibration_is_refused(change, expected):
 
 # -- IMU -------------------------------------------------------------------------------------
 
+
 @build.both_types
-@pytest.mark.parametrize(('change', 'gyro', 'force'), [
-    ({}, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)),
-    ({'accelerometer_covariance': -1.0}, (0.1, 0.2, 0.3), None),
-    ({'accelerometer': (0.0,) * 3}, (0.1, 0.2, 0.3), None),
-    ({'gyro_covariance': -1.0}, None, (0.0, 0.0, 9.8)),
-    ({'gyro': (0.0,) * 3}, (0.0,) * 3, (0.0, 0.0, 9.8))])   # a gyro at rest is a sensor
+@pytest.mark.parametrize(
+    ('change', 'gyro', 'force'),
+    [
+        ({}, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)),
+        ({'accelerometer_covariance': -1.0}, (0.1, 0.2, 0.3), None),
+        ({'accelerometer': (0.0,) * 3}, (0.1, 0.2, 0.3), None),
+        ({'gyro_covariance': -1.0}, None, (0.0, 0.0, 9.8)),
+        ({'gyro': (0.0,) * 3}, (0.0,) * 3, (0.0, 0.0, 9.8)),
+    ],
+)  # a gyro at rest is a sensor
 def test_absent_sensors_are_none(types, change, gyro, force):
     stamp_ns = 1_700_000_000_123_456_789
     message = build.imu(types, stamp_ns, **change)
-    for size in range(8):   # all alignments of the numbers in its bytes
+    for size in range(8):  # all alignments of the numbers in its bytes
         message.header.frame_id = 'x' * size
         for msg in (message, build.serialized(message)):
             for with_gyro in (True, False) if force else (True,):
                 assert incoming.imu_sample_from_message(msg, with_gyro=with_gyro) == ImuSample(
-                    stamp_ns, gyro if with_gyro else None, force)
+                    stamp_ns, gyro if with_gyro else None, force
+                )
 
 
-@pytest.mark.parametrize(('change', 'expected'), [
-    ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity .* finite'),
-    ({'gyro': (0.0, -1e308, 0.0)}, 'angular_velocity .* at most 1000'),
-    ({'accelerometer': (0.0, 0.0, 2e4)}, 'linear_acceleration .* at most'),
-    ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration .* finite'),
-    ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
-])
+@pytest.mark.parametrize(
+    ('change', 'expected'),
+    [
+        ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity .* finite'),
+        ({'gyro': (0.0, -1e308, 0.0)}, 'angular_velocity .* at most 1000'),
+        ({'accelerometer': (0.0, 0.0, 2e4)}, 'linear_acceleration .* at most'),
+        ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration .* finite'),
+        ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
+    ],
+)
 def test_unusable_imu_is_refused(change, expected):
     with pytest.raises(InputError, match=expected):
         incoming.imu_sample_from_message(build.imu(build.rosbags_types, 0, **change))
@@ -303,29 +365,43 @@ def test_unusable_imu_is_refused(change, expected):
 PIXELS = np.random.default_rng(5).integers(0, 256, (480, 640), dtype=np.uint8)
 CONFIGURED = IntrinsicsConfig(
     camera_matrix=(400.0, 0.0, 320.0, 0.0, 401.0, 241.0, 0.0, 0.0, 1.0),
-    distortion_coefficients=(0.1, -0.2, 0.0, 0.0))
+    distortion_coefficients=(0.1, -0.2, 0.0, 0.0),
+)
 
 
 class Fed:
     """An intake that has received the IMU of the first second, and its sequencer."""
 
     def __init__(self, configured: IntrinsicsConfig | None = None) -> None:
-        self.sequencer = Sequencer(Parameters.from_mapping({
-            'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
-        self.intake = Intake(self.sequencer, None if configured is None else Parameters(
-            intrinsics=configured, imu=ImuConfig(stuck_gyro_time=0.0)))
+        self.sequencer = Sequencer(
+            Parameters.from_mapping(
+                {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
+            ),
+            offline=True,
+        )
+        self.intake = Intake(
+            self.sequencer,
+            None
+            if configured is None
+            else Parameters(intrinsics=configured, imu=ImuConfig(stuck_gyro_time=0.0)),
+        )
         for stamp_ns in range(0, 10**9, 5_000_000):
             self.intake.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
 
     def info(self, **change: Any) -> Exception | None:
         return self.intake.receive(
-            Role.CAMERA_INFO, build.camera_info(build.rosbags_types, **change))
+            Role.CAMERA_INFO, build.camera_info(build.rosbags_types, **change)
+        )
 
     def images(self, *numbers: int, height: int = 480) -> None:
         """Images at tenths of a second, no two alike."""
         for k in numbers:
-            self.intake.receive(Role.IMAGE, build.gray_image(
-                build.rosbags_types, np.roll(PIXELS[:height], k), stamp_ns=k * 10**8))
+            self.intake.receive(
+                Role.IMAGE,
+                build.gray_image(
+                    build.rosbags_types, np.roll(PIXELS[:height], k), stamp_ns=k * 10**8
+                ),
+            )
 
     def taken(self) -> list[Any]:
         """Frames and refusals since the last call."""
@@ -382,7 +458,8 @@ def test_configured_intrinsics_replace_the_camera_info(change):
     [frame] = fed.taken()
     assert frame.intrinsics == CONFIGURED.of_image(640, 240)
     fed.intake.receive(
-        Role.IMAGE, build.compressed(build.rosbags_types, b'none', stamp_ns=7 * 10**8))
+        Role.IMAGE, build.compressed(build.rosbags_types, b'none', stamp_ns=7 * 10**8)
+    )
     [refused] = fed.taken()
     assert_refused(refused, Refusal.BAD_IMAGE, 7 * 10**8, 'neither JPEG nor PNG')
     # A recording that ends before.
@@ -413,8 +490,9 @@ def test_unusable_images_are_refused(fed):
 NOISE = np.random.default_rng(0).normal(size=40)
 
 
-def used(values: list[tuple[float, float, float]], step_ms: int = 5,
-         longest: float = 0.025) -> list[str]:
+def used(
+    values: list[tuple[float, float, float]], step_ms: int = 5, longest: float = 0.025
+) -> list[str]:
     """For each sample 'used', '' if it repeats the last one, or the error."""
     gyro, out = StuckGyro(longest), []
     for k, value in enumerate(values):
@@ -451,22 +529,27 @@ def test_a_gyro_that_is_clipped_below_any_range_is_saturated():
     # The first of each stretch is true.
     firsts = clipped[np.diff(clipped, prepend=-2) > 1]
     assert [k for k, text in enumerate(found) if text != 'used'] == sorted(
-        set(clipped.tolist()) - set(firsts.tolist()))
+        set(clipped.tolist()) - set(firsts.tolist())
+    )
     assert any('z axis' in text and 'saturated' in text for text in found)
 
 
-@pytest.mark.parametrize(('values', 'options', 'count'), [
-    # Coarse values that are not the largest, and a bias at rest that is.
-    ([(1.0, -1.0, NOISE[0]), *((0.8, -0.8, z) for z in NOISE)], {}, 41),
-    ([(0.15, -0.15, z) for z in NOISE], {}, 40),
-    # A robot in the plane, and a coarse gyro at rest.
-    ([(0.0, 0.0, z) for z in NOISE], {}, 40),
-    ([(0.001, -0.001, z) for z in NOISE], {}, 40),
-    # Drivers that are faster than their sensor.
-    ([(z, z, z) for z in NOISE for _ in range(5)], {'step_ms': 1}, 40),
-    ([(z, z, z) for z in NOISE for _ in range(2)], {'step_ms': 20}, 40),
-    # Not to be detected.
-    ([(0.0, 0.0, 0.0)] * 100, {'longest': 0.0}, 100)])
+@pytest.mark.parametrize(
+    ('values', 'options', 'count'),
+    [
+        # Coarse values that are not the largest, and a bias at rest that is.
+        ([(1.0, -1.0, NOISE[0]), *((0.8, -0.8, z) for z in NOISE)], {}, 41),
+        ([(0.15, -0.15, z) for z in NOISE], {}, 40),
+        # A robot in the plane, and a coarse gyro at rest.
+        ([(0.0, 0.0, z) for z in NOISE], {}, 40),
+        ([(0.001, -0.001, z) for z in NOISE], {}, 40),
+        # Drivers that are faster than their sensor.
+        ([(z, z, z) for z in NOISE for _ in range(5)], {'step_ms': 1}, 40),
+        ([(z, z, z) for z in NOISE for _ in range(2)], {'step_ms': 20}, 40),
+        # Not to be detected.
+        ([(0.0, 0.0, 0.0)] * 100, {'longest': 0.0}, 100),
+    ],
+)
 def test_sensors_may_repeat_values(values, options, count):
     found = used(values, **options)
     assert found.count('used') == count
@@ -477,10 +560,12 @@ def test_an_image_that_repeats_the_one_before():
     pixels = np.random.default_rng(0).integers(0, 256, 8000, dtype=np.uint8)
     other = pixels.copy()
     other[5050] ^= 1
-    images = [CompressedImage(data, 'jpeg', stamp, 'camera') for stamp, data in enumerate((
-        pixels, pixels.copy(), other, other, pixels[:4000], pixels))]
+    images = [
+        CompressedImage(data, 'jpeg', stamp, 'camera')
+        for stamp, data in enumerate((pixels, pixels.copy(), other, other, pixels[:4000], pixels))
+    ]
     assert [repeats(*two) for two in pairwise(images)] == [True, False, True, False, False]
-    assert not repeats(images[-1], images[-1])   # the same message once more
+    assert not repeats(images[-1], images[-1])  # the same message once more
 
 
 # -- Transforms of a robot: rules, bags, commands, calibration -------------------------------
@@ -492,13 +577,19 @@ BUNDLED = read_parameters(BUNDLED_PARAMETERS)
 
 def tf_message(*transforms: tuple[str, str, Transform]) -> Any:
     of = build.rosbags_types
-    return of('tf2_msgs/msg/TFMessage')(transforms=[
-        of('geometry_msgs/msg/TransformStamped')(
-            header=build.header(of, 0, parent), child_frame_id=child,
-            transform=of('geometry_msgs/msg/Transform')(
-                translation=of('geometry_msgs/msg/Vector3')(*values[:3]),
-                rotation=of('geometry_msgs/msg/Quaternion')(*values[3:])))
-        for parent, child, values in transforms])
+    return of('tf2_msgs/msg/TFMessage')(
+        transforms=[
+            of('geometry_msgs/msg/TransformStamped')(
+                header=build.header(of, 0, parent),
+                child_frame_id=child,
+                transform=of('geometry_msgs/msg/Transform')(
+                    translation=of('geometry_msgs/msg/Vector3')(*values[:3]),
+                    rotation=of('geometry_msgs/msg/Quaternion')(*values[3:]),
+                ),
+            )
+            for parent, child, values in transforms
+        ]
+    )
 
 
 def drawn(seed: int) -> Transform:
@@ -512,9 +603,14 @@ def test_poses_are_chained_over_the_common_root():
     tree = FrameTree()
     tree.add(tf_message(('/base', 'camera', base_camera), ('camera', '/optical', camera_optical)))
     assert tree.lookup('optical', 'imu') is None
-    tree.add(tf_message(('base', 'imu', base_imu), ('base', 'imu', drawn(4)),
-                        ('base', 'broken', (math.nan, 0.0, 0.0, *QUATERNION)),
-                        ('base', 'zero', (0.0,) * 7)))
+    tree.add(
+        tf_message(
+            ('base', 'imu', base_imu),
+            ('base', 'imu', drawn(4)),
+            ('base', 'broken', (math.nan, 0.0, 0.0, *QUATERNION)),
+            ('base', 'zero', (0.0,) * 7),
+        )
+    )
     found = tree.lookup('optical', 'imu')
 
     def moved(pose: Transform, point: Any) -> Any:
@@ -522,7 +618,8 @@ def test_poses_are_chained_over_the_common_root():
 
     point = np.array([0.3, -0.2, 0.9])
     np.testing.assert_allclose(
-        moved(base_imu, point), moved(base_camera, moved(camera_optical, moved(found, point))))
+        moved(base_imu, point), moved(base_camera, moved(camera_optical, moved(found, point)))
+    )
     assert tree.lookup('base', 'broken') is tree.lookup('base', 'zero') is None
     tree.add(tf_message(('b', 'a', FOUND), ('a', 'b', FOUND)))
     assert tree.lookup('a', 'b') is tree.lookup('a', 'base') is None
@@ -533,15 +630,32 @@ def turned(degrees: float) -> Transform:
     return *FOUND[:3], *(turn * Rotation.from_quat(QUATERNION)).as_quat()
 
 
-@pytest.mark.parametrize(('given', 'found', 'names', 'contradiction'), [
-    ({}, FOUND, ['quat_cam_imu_xyzw', 'axes_sigma', 'imu_position', 'imu_position_sigma'], []),
-    ({'quat_cam_imu_xyzw': QUATERNION}, turned(4.0), ['imu_position', 'imu_position_sigma'], []),
-    ({'quat_cam_imu_xyzw': QUATERNION}, turned(6.0), [], ['6.0 deg', '0.5000', '0.5255']),
-    ({'quat_cam_imu_xyzw': QUATERNION, 'axes_sigma': 0.03}, turned(6.0),
-     ['imu_position', 'imu_position_sigma'], []),
-    ({'imu_position': (0.1, 0.2, 0.36)}, FOUND, ['quat_cam_imu_xyzw', 'axes_sigma'], []),
-    ({'imu_position': (0.1, 0.2, 0.5), 'quat_cam_imu_xyzw': QUATERNION}, FOUND, [],
-     ['0.3000', '0.5000'])])
+@pytest.mark.parametrize(
+    ('given', 'found', 'names', 'contradiction'),
+    [
+        ({}, FOUND, ['quat_cam_imu_xyzw', 'axes_sigma', 'imu_position', 'imu_position_sigma'], []),
+        (
+            {'quat_cam_imu_xyzw': QUATERNION},
+            turned(4.0),
+            ['imu_position', 'imu_position_sigma'],
+            [],
+        ),
+        ({'quat_cam_imu_xyzw': QUATERNION}, turned(6.0), [], ['6.0 deg', '0.5000', '0.5255']),
+        (
+            {'quat_cam_imu_xyzw': QUATERNION, 'axes_sigma': 0.03},
+            turned(6.0),
+            ['imu_position', 'imu_position_sigma'],
+            [],
+        ),
+        ({'imu_position': (0.1, 0.2, 0.36)}, FOUND, ['quat_cam_imu_xyzw', 'axes_sigma'], []),
+        (
+            {'imu_position': (0.1, 0.2, 0.5), 'quat_cam_imu_xyzw': QUATERNION},
+            FOUND,
+            [],
+            ['0.3000', '0.5000'],
+        ),
+    ],
+)
 def test_configured_values_win_and_a_contradiction_has_both(given, found, names, contradiction):
     values, text = transforms.extrinsics(Parameters.from_mapping(given), found, 'camera', 'imu')
     assert list(values) == names
@@ -561,13 +675,18 @@ def test_configured_values_win_and_a_contradiction_has_both(given, found, names,
 STATIC = tf_message(('base_link', 'mount', (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)))
 TRUE = tf_message(
     ('mount', CAMERA_FRAME, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)),
-    (CAMERA_FRAME, IMU_FRAME, (0.02, 0.01, 0.0, *BUNDLED.sensor.quat_cam_imu_xyzw)))
+    (CAMERA_FRAME, IMU_FRAME, (0.02, 0.01, 0.0, *BUNDLED.sensor.quat_cam_imu_xyzw)),
+)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory, bundled_bag: Path) -> Path:
-    return bags.copied(bundled_bag, tmp_path_factory.mktemp('tf') / 'bag', seconds=2.0,
-                       first=[('/tf_static', STATIC), ('/tf', TRUE)])
+    return bags.copied(
+        bundled_bag,
+        tmp_path_factory.mktemp('tf') / 'bag',
+        seconds=2.0,
+        first=[('/tf_static', STATIC), ('/tf', TRUE)],
+    )
 
 
 def test_a_bag_gives_what_is_missing(bag):
@@ -577,8 +696,9 @@ def test_a_bag_gives_what_is_missing(bag):
         found, contradiction = with_extrinsics(opened, topics, Parameters.from_mapping(wanted))
         left, _ = with_extrinsics(opened, topics, Parameters.from_mapping({'use_tf': False}))
     assert not contradiction
-    np.testing.assert_allclose(found.sensor.quat_cam_imu_xyzw, BUNDLED.sensor.quat_cam_imu_xyzw,
-                               rtol=1e-5)
+    np.testing.assert_allclose(
+        found.sensor.quat_cam_imu_xyzw, BUNDLED.sensor.quat_cam_imu_xyzw, rtol=1e-5
+    )
     np.testing.assert_allclose(found.imu.imu_position, (0.02, 0.01, 0.0), atol=1e-12)
     np.testing.assert_allclose(found.odometry.base_to_camera, (1.0, 0, 1.0, 0, 0, 0, 1.0))
     assert left == Parameters.from_mapping({'use_tf': False})
@@ -588,6 +708,7 @@ def test_one_frame_for_both_sensors_gives_nothing(tmp_path, bundled_bag):
     def change(message: Any) -> None:
         if hasattr(message, 'header'):
             message.header.frame_id = CAMERA_FRAME
+
     same = bags.copied(bundled_bag, tmp_path / 'bag', change, 0.2, [('/tf', TRUE)])
     with open_bag(same) as opened:
         assert with_extrinsics(opened, opened.find_topics(), Parameters())[0] == Parameters()
@@ -600,8 +721,12 @@ def run(*arguments: object) -> int:
 def test_commands_need_only_the_readout_time(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     bias = ', '.join(map(str, BUNDLED.imu.gyro_bias))
-    known = ('--set', f'readout_time={BUNDLED.sensor.readout_time}', '--set',
-             f'gyro_bias=[{bias}]')
+    known = (
+        '--set',
+        f'readout_time={BUNDLED.sensor.readout_time}',
+        '--set',
+        f'gyro_bias=[{bias}]',
+    )
     assert run('replay', bag, *known, '--no-pictures') == 0
     summary = json.loads((tmp_path / 'bag_relpose' / 'summary.json').read_text())
     assert summary['parameters']['imu_position_sigma'] == 0.02
@@ -623,6 +748,7 @@ def test_commands_report_a_contradiction(bag, tmp_path, monkeypatch, capsys, cap
 
 # -- results as messages ---------------------------------------------------------------------
 
+
 def pair() -> PairResult:
     """A pair with covariances, outliers, and a rotation whose quaternion may have w < 0."""
     rng = np.random.default_rng(3)
@@ -631,10 +757,18 @@ def pair() -> PairResult:
     covariance, velocity_covariance = halves @ np.swapaxes(halves, 1, 2)
     # By more than 180 degrees about z.
     R = Rotation.from_euler('xyz', [0.1, -0.2, 3.3]).as_matrix()
-    return replace(result, pose=replace(
-        result.pose, R=R, inliers=rng.random(40) < 0.7, covariance=covariance,
-        velocity_covariance=velocity_covariance), images_against_gyro=np.array([0.0, 3e-3, 4e-3]),
-        gyro_bias=np.array([1e-3, 0.0, -2e-3]))
+    return replace(
+        result,
+        pose=replace(
+            result.pose,
+            R=R,
+            inliers=rng.random(40) < 0.7,
+            covariance=covariance,
+            velocity_covariance=velocity_covariance,
+        ),
+        images_against_gyro=np.array([0.0, 3e-3, 4e-3]),
+        gyro_bias=np.array([1e-3, 0.0, -2e-3]),
+    )
 
 
 def values_of(messages: dict[str, Any]) -> dict[str, str]:
@@ -650,33 +784,44 @@ def test_pair_messages(types):
     assert list(messages) == list(outgoing.PAIR_TOPICS)
     for topic, message in messages.items():
         assert incoming.stamp_ns(message.header) == result.stamp_ns
-        assert message.header.frame_id == {'reference': 'camera', 'velocity': 'camera',
-                                           'pairs': ''}.get(topic, 'camera_reference')
+        assert message.header.frame_id == {
+            'reference': 'camera',
+            'velocity': 'camera',
+            'pairs': '',
+        }.get(topic, 'camera_reference')
     pose, rotation = messages['relative_pose'].pose, messages['relative_rotation']
     q, t = pose.pose.orientation, pose.pose.position
     assert q.w >= 0.0
-    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
-                               result.pose.R, atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), result.pose.R, atol=1e-12
+    )
     assert [t.x, t.y, t.z] == result.pose.t.tolist()
     # Row-major, x y z rotX rotY rotZ.
     np.testing.assert_allclose(
-        np.reshape(pose.covariance, (6, 6)), result.pose.covariance, rtol=1e-9)
+        np.reshape(pose.covariance, (6, 6)), result.pose.covariance, rtol=1e-9
+    )
     twist = messages['velocity'].twist
     linear, angular = twist.twist.linear, twist.twist.angular
     assert [linear.x, linear.y, linear.z] == result.pose.linear_velocity2.tolist()
     assert [angular.x, angular.y, angular.z] == result.pose.angular_velocity2.tolist()
     assert (rotation.orientation, rotation.angular_velocity) == (q, angular)
-    for block, whole in ((rotation.orientation_covariance, pose.covariance),
-                         (rotation.angular_velocity_covariance, twist.covariance)):
+    for block, whole in (
+        (rotation.orientation_covariance, pose.covariance),
+        (rotation.angular_velocity_covariance, twist.covariance),
+    ):
         np.testing.assert_allclose(
-            np.reshape(block, (3, 3)), np.reshape(whole, (6, 6))[3:, 3:], rtol=1e-9)
+            np.reshape(block, (3, 3)), np.reshape(whole, (6, 6))[3:, 3:], rtol=1e-9
+        )
     assert rotation.linear_acceleration_covariance[0] == -1.0
     [status] = messages['pairs'].status
     assert status.level in (0, b'\0')
     assert (status.message, status.hardware_id) == ('OK', 'camera')
     values = values_of(messages)
     assert (values['model'], values['matches'], values['inliers']) == (
-        'uniform', '40', str(result.pose.inliers.sum()))
+        'uniform',
+        '40',
+        str(result.pose.inliers.sum()),
+    )
     assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(np.degrees(5e-3))
     assert values['residual_rms_px'] == values['baseline_m'] == ''
     assert values['gyro_bias_rad_s'] == '0.001 0.0 -0.002'
@@ -690,19 +835,26 @@ def test_health_is_published_with_every_pair(types, state, level):
     messages = build.pair_messages(replace(pair(), health=Assessment((finding,))), types)
     values = values_of(messages)
     assert (values['health'], values['health_findings']) == (
-        state, f'time_offset {state}: as it is')
+        state,
+        f'time_offset {state}: as it is',
+    )
     assert messages['pairs'].status[0].level in (level, bytes([level]))
     assert published_pair(messages).health == state
 
 
 @build.both_types
-@pytest.mark.parametrize('status', [
-    Status.PURE_ROTATION, Status.LOW_PARALLAX, Status.NO_CONSENSUS])
+@pytest.mark.parametrize(
+    'status', [Status.PURE_ROTATION, Status.LOW_PARALLAX, Status.NO_CONSENSUS]
+)
 def test_a_pair_without_a_pose(types, status):
     whole = pair()
     known = status is not Status.NO_CONSENSUS
-    result = replace(whole, pose=whole.pose.without_translation(status, 'none') if known
-                     else RelativePose(status=status, reason='none'))
+    result = replace(
+        whole,
+        pose=whole.pose.without_translation(status, 'none')
+        if known
+        else RelativePose(status=status, reason='none'),
+    )
     messages = build.pair_messages(result, types, 'base')
     assert list(messages) == ['relative_rotation'] * known + ['pairs']
     assert values_of(messages)['topics'] == 'relative_rotation' * known
@@ -717,7 +869,7 @@ def test_published_covariances_have_no_negative_eigenvalue():
     rng = np.random.default_rng(0)
     lowest = []
     for _ in range(300):
-        factor = rng.normal(size=(6, 5)) * 10.0**rng.uniform(-4.0, 0.0, (6, 1))
+        factor = rng.normal(size=(6, 5)) * 10.0 ** rng.uniform(-4.0, 0.0, (6, 1))
         covariance = factor @ factor.T
         lowest.append(np.linalg.eigvalsh(covariance)[0])
         covariance[0, 5] *= 1.0 + 1e-15
@@ -732,12 +884,32 @@ def test_published_covariances_have_no_negative_eigenvalue():
 def test_matches_are_the_inliers(types):
     result = pair()
     assert build.pair_messages(result, types)['matches'].is_dense
-    result.landmarks.points[result.pose.inliers.argmax()] = np.nan   # its rays are parallel
+    result.landmarks.points[result.pose.inliers.argmax()] = np.nan  # its rays are parallel
     cloud = build.pair_messages(result, types)['matches']
     assert cloud.header.frame_id == 'camera_reference'
     assert not cloud.is_dense
-    names = ['u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
-             'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs', 'id']
+    names = [
+        'u1',
+        'v1',
+        'u2',
+        'v2',
+        'tau1',
+        'tau2',
+        'x1',
+        'y1',
+        'z1',
+        'x2',
+        'y2',
+        'z2',
+        'x',
+        'y',
+        'z',
+        'u1_gs',
+        'v1_gs',
+        'u2_gs',
+        'v2_gs',
+        'id',
+    ]
     assert [field.name for field in cloud.fields] == names
     # Floats first: read_points_numpy of sensor_msgs_py asks that all fields that it reads have the
     # type of the first, be that read or not.
@@ -749,17 +921,25 @@ def test_matches_are_the_inliers(types):
     raw = bytes(cloud.data)
     for row, index in enumerate(np.flatnonzero(result.pose.inliers)):
         record = struct.unpack_from('<19fI', raw, row * cloud.point_step)
-        expected = [*result.matches.points1[index],
-                    *result.matches.points2[index], result.row_times1[index],
-                    result.row_times2[index], *result.rays1[index], *result.rays2[index],
-                    *result.landmarks.points[index], *result.landmarks.pixels1[index],
-                    *result.landmarks.pixels2[index], result.matches.track_ids[index]]
+        expected = [
+            *result.matches.points1[index],
+            *result.matches.points2[index],
+            result.row_times1[index],
+            result.row_times2[index],
+            *result.rays1[index],
+            *result.rays2[index],
+            *result.landmarks.points[index],
+            *result.landmarks.pixels1[index],
+            *result.landmarks.pixels2[index],
+            result.matches.track_ids[index],
+        ]
         np.testing.assert_allclose(record, expected, rtol=1e-6)
 
 
 def test_messages_of_rclpy_and_rosbags_serialise_alike():
-    ours, theirs = (build.pair_messages(pair(), types)
-                    for types in (build.rclpy_types, build.rosbags_types))
+    ours, theirs = (
+        build.pair_messages(pair(), types) for types in (build.rclpy_types, build.rosbags_types)
+    )
     for topic, message in theirs.items():
         assert deserialize_message(build.serialized(message), type(ours[topic])) == ours[topic]
 
@@ -772,18 +952,35 @@ STAMP_NS = 1_700_000_000_123_456_789
 def test_messages_of_sensors(tmp_path):
     """As written by `simulate` and `convert`, whose tests read their images and poses back."""
     camera = RollingShutterCamera(
-        width=64, height=48, fx=50.0, fy=51.0, cx=31.0, cy=23.0, readout_time=0.03,
-        distortion=(-0.1, 0.01, 0.0, 0.0, 0.0))
+        width=64,
+        height=48,
+        fx=50.0,
+        fy=51.0,
+        cx=31.0,
+        cy=23.0,
+        readout_time=0.03,
+        distortion=(-0.1, 0.01, 0.0, 0.0, 0.0),
+    )
     with BagWriter(tmp_path / 'deep' / 'bag') as bag:
-        for number, message in enumerate((
-                outgoing.imu_message(STAMP_NS, 'imu_link', (0.1, 0.2, 0.3), (1.0, 2.0, 9.8),
-                                     bag.type, angular_velocity_covariance=4e-6 * np.eye(3)),
-                outgoing.camera_info_message(STAMP_NS, 'cam', camera, None, bag.type))):
+        for number, message in enumerate(
+            (
+                outgoing.imu_message(
+                    STAMP_NS,
+                    'imu_link',
+                    (0.1, 0.2, 0.3),
+                    (1.0, 2.0, 9.8),
+                    bag.type,
+                    angular_velocity_covariance=4e-6 * np.eye(3),
+                ),
+                outgoing.camera_info_message(STAMP_NS, 'cam', camera, None, bag.type),
+            )
+        ):
             bag.write(f'/{number}', message.__msgtype__, message, STAMP_NS + number)
     with AnyReader([tmp_path / 'deep' / 'bag']) as reader:
         (topic, time_ns, imu), (*_, info) = (
             (connection.topic, time_ns, reader.deserialize(data, connection.msgtype))
-            for connection, time_ns, data in reader.messages())
+            for connection, time_ns, data in reader.messages()
+        )
     assert (topic, time_ns, incoming.stamp_ns(imu.header)) == ('/0', STAMP_NS, STAMP_NS)
     assert imu.header.frame_id == 'imu_link'
     assert (imu.angular_velocity.x, imu.linear_acceleration.z) == (0.1, 9.8)

@@ -41,14 +41,23 @@ MS = 1_000_000
 NONE = np.zeros(DEVIATIONS)
 R_CAM_IMU = Rotation.from_euler('xyz', [90, 0, 30], degrees=True)
 CAMERA = RollingShutterCamera(
-    width=640, height=480, fx=420.0, fy=420.0, cx=318.0, cy=242.0, readout_time=0.03,
-    distortion=(-0.12, 0.03, 0.0, 0.0))
-PARAMETERS = Parameters.from_mapping({
-    'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())})
+    width=640,
+    height=480,
+    fx=420.0,
+    fy=420.0,
+    cx=318.0,
+    cy=242.0,
+    readout_time=0.03,
+    distortion=(-0.12, 0.03, 0.0, 0.0),
+)
+PARAMETERS = Parameters.from_mapping(
+    {'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())}
+)
 # Small deviations: rad, s, s, rad/s, -, -, -.
 SMALL = np.array([3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01, 0.01])
-CONFIGURED = assessment.Configured(PARAMETERS.sensor, CAMERA, np.zeros(3),
-                                   assessment.configured_sigmas(PARAMETERS, 0.0), NONE)
+CONFIGURED = assessment.Configured(
+    PARAMETERS.sensor, CAMERA, np.zeros(3), assessment.configured_sigmas(PARAMETERS, 0.0), NONE
+)
 
 
 def deviation(**values):
@@ -71,7 +80,7 @@ POINTS = RNG.uniform([-4, -3, 4], [9, 4, 14], (900, 3))
 def exposed(camera, start):
     """Pixels (N, 2) of a frame whose stamped row is exposed at `start` [s], and if it is."""
     tau = np.zeros(len(POINTS))
-    for _ in range(8):   # a row rotates the camera by far less than a row
+    for _ in range(8):  # a row rotates the camera by far less than a row
         local = ORIENTATION(start + tau).inv().apply(POINTS - (start + tau)[:, None] * VELOCITY)
         pixels = camera.project(local)
         tau = np.clip(np.nan_to_num(camera.row_times(pixels[:, 1])), -0.1, 0.1)
@@ -82,8 +91,9 @@ def exposed(camera, start):
 def gyro(start, end, c):
     """Times (K,) [ns], and the rates of the gyro (K, 3), in camera axes as configured."""
     stamps_ns = np.round(np.linspace(start, end, 2 + int((end - start) * 1e3)) * 1e9)
-    in_imu = (Rotation.from_rotvec(c[AXES]) * R_CAM_IMU).inv().apply(
-        ORIENTATION(1e-9 * stamps_ns, 1))
+    in_imu = (
+        (Rotation.from_rotvec(c[AXES]) * R_CAM_IMU).inv().apply(ORIENTATION(1e-9 * stamps_ns, 1))
+    )
     return stamps_ns.astype(np.int64), R_CAM_IMU.apply((in_imu + c[BIAS]) / (1.0 + c[SCALE]))
 
 
@@ -91,9 +101,14 @@ def deviating(camera, c):
     """The camera with the deviations `c` of lens and readout."""
     signed = camera.line_delay * camera.height + c[READOUT]
     first, *others = camera.distortion
-    return replace(camera, fx=camera.fx / (1.0 + c[FOCAL]), fy=camera.fy / (1.0 + c[FOCAL]),
-                   distortion=(first + c[DISTORTION], *others), readout_time=abs(signed),
-                   readout_direction='down' if signed >= 0.0 else 'up')
+    return replace(
+        camera,
+        fx=camera.fx / (1.0 + c[FOCAL]),
+        fy=camera.fy / (1.0 + c[FOCAL]),
+        distortion=(first + c[DISTORTION], *others),
+        readout_time=abs(signed),
+        readout_direction='down' if signed >= 0.0 else 'up',
+    )
 
 
 def pair_data(start, end, c, camera=CAMERA):
@@ -112,11 +127,20 @@ def pair_data(start, end, c, camera=CAMERA):
     first, second = (ORIENTATION(stamp + c[OFFSET]) for stamp in (start, end))
     t = first.inv().apply(VELOCITY)
     return PairData(
-        places[0][0][estimated], places[1][0][estimated], camera, *motions, end - start,
-        (first.inv() * second).as_matrix(), t / np.linalg.norm(t), rotation, covariance,
+        places[0][0][estimated],
+        places[1][0][estimated],
+        camera,
+        *motions,
+        end - start,
+        (first.inv() * second).as_matrix(),
+        t / np.linalg.norm(t),
+        rotation,
+        covariance,
         rotation_sensitivity(stamps_ns, rates, ImuConfig()),
         integration.GyroSegment(stamps_ns, rates, np.zeros(3), 3e-3),
-        R_CAM_IMU.as_matrix(), 0.01)
+        R_CAM_IMU.as_matrix(),
+        0.01,
+    )
 
 
 def flight(c, pairs=9, camera=CAMERA):
@@ -139,8 +163,11 @@ def test_pairs_are_exact_at_times_that_are_far_off():
     np.testing.assert_allclose((exact.solved().c - c)[[OFFSET, READOUT]], 0.0, atol=1e-4)
 
 
-@pytest.mark.parametrize('signs', [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1]],
-                         ids=[*map(str, range(DEVIATIONS)), 'all'])
+@pytest.mark.parametrize(
+    'signs',
+    [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1]],
+    ids=[*map(str, range(DEVIATIONS)), 'all'],
+)
 def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
     """Noise-free; about the solution again, since a pair is not linear in it."""
     c = SMALL * signs
@@ -148,7 +175,7 @@ def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
     first = solved(pairs, NONE, NONE)
     found = solved(pairs, NONE, first)
     # Shaking within a readout is known to first order only, which bias and lens do not rotate.
-    exact = not (c[:BIAS.start].any() or c[SCALE])
+    exact = not (c[: BIAS.start].any() or c[SCALE])
     np.testing.assert_allclose(found / SMALL, signs, atol=0.015 if exact else 0.15)
     # Active deviations are added.
     np.testing.assert_allclose(solved(pairs, 0.5 * c, 0.5 * c) - 0.5 * c, first, rtol=1e-9)
@@ -165,11 +192,20 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
     def estimated(start, deviation):
         pair = pair_data(start, start + 0.3, deviation, camera)
         n = len(pair.points1)
-        pair = replace(pair, points1=pair.points1 + noise[0, :n],
-                       points2=pair.points2 + noise[1, :n])
+        pair = replace(
+            pair, points1=pair.points1 + noise[0, :n], points2=pair.points2 + noise[1, :n]
+        )
         return pair, estimate_relative_pose(
-            pair.points1, pair.points2, camera, pair.motion1, pair.motion2, pair.gyro_rotation,
-            pair.gyro_covariance, pair.interval, EstimatorConfig(pixel_sigma=0.3))
+            pair.points1,
+            pair.points2,
+            camera,
+            pair.motion1,
+            pair.motion2,
+            pair.gyro_rotation,
+            pair.gyro_covariance,
+            pair.interval,
+            EstimatorConfig(pixel_sigma=0.3),
+        )
 
     def off(pair, pose):
         turn = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
@@ -193,23 +229,40 @@ def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estima
         def estimated(right=0.0, down=0.0, pair=pair):
             camera = replace(CAMERA, cx=CAMERA.cx + right, cy=CAMERA.cy + down)
             return estimate_relative_pose(
-                pair.points1, pair.points2, camera, pair.motion1, pair.motion2,
-                pair.gyro_rotation, pair.gyro_covariance, pair.interval,
-                EstimatorConfig(pixel_sigma=0.3))
+                pair.points1,
+                pair.points2,
+                camera,
+                pair.motion1,
+                pair.motion2,
+                pair.gyro_rotation,
+                pair.gyro_covariance,
+                pair.interval,
+                EstimatorConfig(pixel_sigma=0.3),
+            )
 
         pose = estimated()
-        exact, doubtful = (ConsistencyMonitor().add_pair(
-            0, replace(pair, R=pose.R, t=pose.t), pose,
-            replace(CONFIGURED, center_sigma=sigma)).covariance for sigma in (0.0, 2.0))
-        shifts = np.array([[*(moved.t - pose.t),
-                            *Rotation.from_matrix(moved.R @ pose.R.T).as_rotvec()]
-                           for moved in (estimated(right=2.0), estimated(down=2.0))])
+        exact, doubtful = (
+            ConsistencyMonitor()
+            .add_pair(
+                0, replace(pair, R=pose.R, t=pose.t), pose, replace(CONFIGURED, center_sigma=sigma)
+            )
+            .covariance
+            for sigma in (0.0, 2.0)
+        )
+        shifts = np.array(
+            [
+                [*(moved.t - pose.t), *Rotation.from_matrix(moved.R @ pose.R.T).as_rotvec()]
+                for moved in (estimated(right=2.0), estimated(down=2.0))
+            ]
+        )
         added, expected = doubtful - exact, shifts.T @ shifts
         # Of t, which other priors of the velocities move otherwise, within its sigma.
-        np.testing.assert_allclose(added[3:, 3:], expected[3:, 3:],
-                                   atol=0.2 * np.trace(expected[3:, 3:]))
-        assert abs(math.sqrt(np.trace(added[:3, :3])) - math.sqrt(np.trace(
-            expected[:3, :3]))) < 0.5 * math.sqrt(np.trace(pose.covariance[:3, :3]))
+        np.testing.assert_allclose(
+            added[3:, 3:], expected[3:, 3:], atol=0.2 * np.trace(expected[3:, 3:])
+        )
+        assert abs(
+            math.sqrt(np.trace(added[:3, :3])) - math.sqrt(np.trace(expected[:3, :3]))
+        ) < 0.5 * math.sqrt(np.trace(pose.covariance[:3, :3]))
 
 
 def test_the_rotation_of_the_images_does_not_follow_the_gyro():
@@ -234,11 +287,13 @@ def test_derivative_by_the_rates_by_finite_differences():
         more, _ = integrate_rotation(stamps, rates + step, ImuConfig(), 0.0)
         less, _ = integrate_rotation(stamps, rates - step, ImuConfig(), 0.0)
         np.testing.assert_allclose(
-            Rotation.from_matrix(more @ less.T).as_rotvec() / 2e-5, by_rate[:, axis], atol=1e-5)
+            Rotation.from_matrix(more @ less.T).as_rotvec() / 2e-5, by_rate[:, axis], atol=1e-5
+        )
     assert not np.allclose(by_rate, 0.5 * np.eye(3), atol=0.01)
 
 
 # -- the pairs of the last seconds ---------------------------------------------------------------
+
 
 def recursion_of(pairs, stamps_ns):
     sums = Recursion()
@@ -260,13 +315,18 @@ def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
 
 # -- rotations of images and gyro ----------------------------------------------------------------
 
+
 def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0), noise=1e-3):
     """Images rotate by `scale` times Q times the gyro's rotation, about axes by `weights`."""
     rng, sums = np.random.default_rng(seed), RotationSums()
     for k in range(count):
         by_gyro = size * rng.normal(size=3) * weights
-        sums.add(100 * MS * k, 0.1,
-                 scale * np.asarray(Q) @ by_gyro + noise * rng.normal(size=3), by_gyro)
+        sums.add(
+            100 * MS * k,
+            0.1,
+            scale * np.asarray(Q) @ by_gyro + noise * rng.normal(size=3),
+            by_gyro,
+        )
     return sums
 
 
@@ -276,9 +336,16 @@ def faults_of(sums):
     return assessment.assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED).faults
 
 
-@pytest.mark.parametrize(('axis', 'angle', 'named'), [
-    (2, 90.0, 'by 90 deg clockwise'), (2, -90.0, 'by 90 deg counterclockwise'), (1, 90.0, ''),
-    (2, 130.0, ''), (2, 180.0, 'upside down')])
+@pytest.mark.parametrize(
+    ('axis', 'angle', 'named'),
+    [
+        (2, 90.0, 'by 90 deg clockwise'),
+        (2, -90.0, 'by 90 deg counterclockwise'),
+        (1, 90.0, ''),
+        (2, 130.0, ''),
+        (2, 180.0, 'upside down'),
+    ],
+)
 def test_images_on_their_side_are_offered_as_reason(axis, angle, named):
     """Clockwise: a point right of the centre is below it then, as y points down."""
     turn = Rotation.from_rotvec(math.radians(angle) * np.eye(3)[axis]).as_matrix()
@@ -294,16 +361,25 @@ def test_a_gross_error_persists_until_it_is_contradicted():
     degrees, unknown = rotations(np.eye(3), math.radians(1.0), size=3.0).compared(), None
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()
     found = ()
-    for compared, named in ((independent, 'image_geometry'), (degrees, 'gyro_unit'),
-                            (unknown, 'gyro_unit'), (independent, 'gyro_unit')):
+    for compared, named in (
+        (independent, 'image_geometry'),
+        (degrees, 'gyro_unit'),
+        (unknown, 'gyro_unit'),
+        (independent, 'gyro_unit'),
+    ):
         found = assessment.gross_errors(compared, 0.0, CONFIGURED, found)
         assert found[0].quantity == named
     assert not assessment.gross_errors(rotations(np.eye(3)).compared(), 0.0, CONFIGURED, found)
 
 
-@pytest.mark.parametrize('ahead, message', [
-    (5.03, "the clock of the IMU is 5.0 s ahead of the images'"),
-    (-2.0, "the clock of the IMU is 2.0 s behind the images'"), (0.3, '')])
+@pytest.mark.parametrize(
+    'ahead, message',
+    [
+        (5.03, "the clock of the IMU is 5.0 s ahead of the images'"),
+        (-2.0, "the clock of the IMU is 2.0 s behind the images'"),
+        (0.3, ''),
+    ],
+)
 def test_clocks_that_differ_by_seconds_are_named(ahead, message):
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()
     fault = assessment.gross_errors(independent, ahead, CONFIGURED)[0]
@@ -314,8 +390,12 @@ def test_clocks_that_differ_by_seconds_are_named(ahead, message):
 
 def test_an_accelerometer_in_g_is_named_after_a_second():
     sums, fault = AccelerationSums(), force_fault(np.array([[0.0, 0.0, 1.0]] * 9))
-    for stamp_ns, reason, named in ((0, fault, False), (600 * MS, fault, False),
-                                    (1200 * MS, fault, True), (1300 * MS, 'a gap', False)):
+    for stamp_ns, reason, named in (
+        (0, fault, False),
+        (600 * MS, fault, False),
+        (1200 * MS, fault, True),
+        (1300 * MS, 'a gap', False),
+    ):
         sums.report(stamp_ns, reason)
         finding = sums.finding()
         assert (finding is not None) is named
@@ -324,8 +404,10 @@ def test_an_accelerometer_in_g_is_named_after_a_second():
     assert not force_fault(np.array([[0.0, 9.8, 1.0]] * 9))
 
 
-@pytest.mark.parametrize(('rotvec', 'scale', 'size'), [
-    ([0.0, 0.0, 0.0], 1.0, 0.05), ([1.0, -1.5, 0.4], math.radians(1.0), 3.0)])
+@pytest.mark.parametrize(
+    ('rotvec', 'scale', 'size'),
+    [([0.0, 0.0, 0.0], 1.0, 0.05), ([1.0, -1.5, 0.4], math.radians(1.0), 3.0)],
+)
 def test_rotated_axes_and_another_unit_are_found(rotvec, scale, size):
     Q = Rotation.from_rotvec(rotvec)
     compared = rotations(Q.as_matrix(), scale, size=size).compared()
@@ -355,8 +437,8 @@ def test_a_gyro_with_little_more_than_its_bias(rotating):
 def test_a_steady_translation_is_no_rotation():
     """It is similar to a constant rate of the images, without information on the axes."""
     rng, sums = np.random.default_rng(5), RotationSums()
-    steady, drift = np.array([0.0, 0.15, 0.0]), np.array([0.0, -0.25, 0.07])   # [rad/s]
-    for k, spread in enumerate([0.01] * 12 + [1e-4] * 40):   # it sways, then moves steadily
+    steady, drift = np.array([0.0, 0.15, 0.0]), np.array([0.0, -0.25, 0.07])  # [rad/s]
+    for k, spread in enumerate([0.01] * 12 + [1e-4] * 40):  # it sways, then moves steadily
         by_gyro = 0.1 * steady + spread * rng.normal(size=3)
         sums.add(100 * MS * k, 0.1, by_gyro + 0.1 * drift + 1e-3 * rng.normal(size=3), by_gyro)
     assert not faults_of(sums)
@@ -367,12 +449,17 @@ def test_a_steady_translation_is_no_rotation():
 def test_a_constant_rate(noise, still):
     """A turntable is consistent; still images of a rotating gyro are not of its camera."""
     rng, sums = np.random.default_rng(5), RotationSums()
-    steady = 0.125 * np.array([0.0, 0.5, 0.0])   # in 1/8 s, exact in binary
+    steady = 0.125 * np.array([0.0, 0.5, 0.0])  # in 1/8 s, exact in binary
     for k in range(60):
-        sums.add(125 * MS * k, 0.125, (not still) * steady + 1e-3 * rng.normal(size=3),
-                 steady + noise * rng.normal(size=3))
+        sums.add(
+            125 * MS * k,
+            0.125,
+            (not still) * steady + 1e-3 * rng.normal(size=3),
+            steady + noise * rng.normal(size=3),
+        )
     assert [fault.quantity for fault in faults_of(sums)] == (
-        ['image_geometry', 'time_offset'] if still else [])
+        ['image_geometry', 'time_offset'] if still else []
+    )
 
 
 @pytest.mark.parametrize('axis', range(3))
@@ -382,7 +469,7 @@ def test_left_handed_axes_are_no_rotation(axis):
     signs[axis] = -1.0
     sums = rotations(R @ np.diag(signs) @ R.T, count=80, noise=0.035)
     assert sums.compared().is_left_handed
-    fault, = faults_of(sums)
+    (fault,) = faults_of(sums)
     assert fault.quantity == 'axes'
     assert f'wrong sign of {"xyz"[axis]}' in fault.message
     # About one axis both fit equally.
@@ -400,11 +487,12 @@ def test_too_little_rotation_is_not_compared():
     assert rotations(np.eye(3), size=1e-3, count=20).compared() is None
     assert rotations(np.eye(3), count=4).compared() is None
     sums = rotations(np.eye(3))
-    sums.add(0, 0.1, np.ones(3), np.ones(3))   # time went back
+    sums.add(0, 0.1, np.ones(3), np.ones(3))  # time went back
     assert sums.compared() is None
 
 
 # -- assessment ----------------------------------------------------------------------------------
+
 
 def test_rotation_of_rays_withstands_near_points():
     rng = np.random.default_rng(0)
@@ -425,26 +513,33 @@ def calibration(c, sigma, coupled=0.0):
     S = correlation / np.outer(sigma, sigma)
     covariance = np.linalg.inv(S + np.diag(recursion.PRIOR_SIGMA**-2.0))
     pairs = np.tile(S / 20, (20, 1, 1))
-    return recursion.Calibration(np.asarray(c), covariance, pairs, pairs @ c, np.ones(20),
-                                 np.asarray(c), 1.0, 1.0, 1.0)
+    return recursion.Calibration(
+        np.asarray(c), covariance, pairs, pairs @ c, np.ones(20), np.asarray(c), 1.0, 1.0, 1.0
+    )
 
 
 SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])
 # Ten sigmas of a deviation turn a pose by its own sigma.
 EFFECT = assessment.Effect(
-    *(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6)))
+    *(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6))
+)
 
 
 def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
-    return assessment.assess(estimated, assessment.find_inconsistencies(
-        estimated, [effect], configured), (), configured)
+    return assessment.assess(
+        estimated, assessment.find_inconsistencies(estimated, [effect], configured), (), configured
+    )
 
 
-@pytest.mark.parametrize(('c', 'coupled', 'named'), [
-    # Not distributed among similar quantities.
-    (deviation(offset=0.01), 0.95, {'time_offset'}),
-    (deviation(offset=0.01, readout=-0.008), 0.6, {'time_offset', 'readout_time'}),
-    (3.0 * deviation(focal=SIGMA[FOCAL]), 0.0, set())])   # not certain
+@pytest.mark.parametrize(
+    ('c', 'coupled', 'named'),
+    [
+        # Not distributed among similar quantities.
+        (deviation(offset=0.01), 0.95, {'time_offset'}),
+        (deviation(offset=0.01, readout=-0.008), 0.6, {'time_offset', 'readout_time'}),
+        (3.0 * deviation(focal=SIGMA[FOCAL]), 0.0, set()),
+    ],
+)  # not certain
 def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
     found = assessment.find_inconsistencies(calibration(c, SIGMA, coupled), [EFFECT], CONFIGURED)
     assert {one.quantity.name for one in found} == named
@@ -452,29 +547,32 @@ def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
         # The prior of free quantities is wide, not absent.
         np.testing.assert_allclose(sum(one.deviation for one in found), c, rtol=0.01)
     if len(named) == 1:
-        assert found[0].shift == pytest.approx(2.0, rel=0.01)   # 20 sigmas
+        assert found[0].shift == pytest.approx(2.0, rel=0.01)  # 20 sigmas
     # Active deviations are no inconsistency.
-    assert not assessment.find_inconsistencies(calibration(c, SIGMA), [EFFECT],
-                                               replace(CONFIGURED, active=c))
+    assert not assessment.find_inconsistencies(
+        calibration(c, SIGMA), [EFFECT], replace(CONFIGURED, active=c)
+    )
     assert not assessment.find_inconsistencies(recursion.NOTHING_ESTIMATED, [], CONFIGURED)
 
 
-@pytest.mark.parametrize('correlation, named', [
-    (0.999, {'time_offset', 'readout_time'}), (0.8, {'time_offset'})])
+@pytest.mark.parametrize(
+    'correlation, named', [(0.999, {'time_offset', 'readout_time'}), (0.8, {'time_offset'})]
+)
 def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named):
     faults = assessed(calibration(deviation(offset=0.01), SIGMA, correlation)).faults
     assert {fault.quantity for fault in faults} == named
-    assert all(('time_offset or readout_time' in fault.fix) is (len(named) > 1)
-               for fault in faults)
+    assert all(
+        ('time_offset or readout_time' in fault.fix) is (len(named) > 1) for fault in faults
+    )
 
 
 def test_the_error_that_linearisation_leaves_is_in_the_sigma():
     """And, in the published one, that of matches which were selected with the wrong value."""
     c = deviation(offset=0.02)
     estimated = replace(calibration(c, SIGMA), about=deviation(offset=0.014))
-    found, = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
+    (found,) = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
     assert found.sigma[OFFSET] == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
-    fault, = assessed(estimated).faults
+    (fault,) = assessed(estimated).faults
     assert fault.sigma == pytest.approx(math.hypot(found.sigma[OFFSET], 0.002), rel=0.01)
 
 
@@ -484,7 +582,9 @@ def test_times_that_are_likely_to_be_off_are_linearised_there(size, likely):
     c = deviation(offset=size * SIGMA[OFFSET], focal=3.9 * SIGMA[FOCAL])
     np.testing.assert_allclose(
         assessment.likely(calibration(c, SIGMA), CONFIGURED),
-        deviation(offset=likely * SIGMA[OFFSET]), rtol=0.01)
+        deviation(offset=likely * SIGMA[OFFSET]),
+        rtol=0.01,
+    )
 
 
 def test_configured_sigmas_bound_what_a_deviation_may_explain():
@@ -494,13 +594,25 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
     assert {fault.quantity for fault in assessed(estimated).faults} == {'time_offset'}
     assert not assessed(estimated, configured=known).faults
     # Before any pair: the whole configured sigma, without doubts about other parameters.
-    small = assessment.configured_sigmas(Parameters.from_mapping({
-        'readout_time_sigma': 1e-3, 'time_offset_sigma': 3e-4, 'axes_sigma': 0.01,
-        'time_offset_per_interval_sigma': 0.04, 'focal_length_sigma': 0.01,
-        'distortion_sigma': 0.02}), from_reference=0.01)
+    small = assessment.configured_sigmas(
+        Parameters.from_mapping(
+            {
+                'readout_time_sigma': 1e-3,
+                'time_offset_sigma': 3e-4,
+                'axes_sigma': 0.01,
+                'time_offset_per_interval_sigma': 0.04,
+                'focal_length_sigma': 0.01,
+                'distortion_sigma': 0.02,
+            }
+        ),
+        from_reference=0.01,
+    )
     assert small[OFFSET] == pytest.approx(5e-4) and small[BIAS].tolist() == [0.003] * 3
-    doubt = np.sqrt(np.diag(assessment.undetermined(recursion.NOTHING_ESTIMATED, replace(
-        CONFIGURED, sigmas=small))))
+    doubt = np.sqrt(
+        np.diag(
+            assessment.undetermined(recursion.NOTHING_ESTIMATED, replace(CONFIGURED, sigmas=small))
+        )
+    )
     given = [0, 1, 2, OFFSET, READOUT, FOCAL, 10]
     np.testing.assert_allclose(doubt[given], small[given])
     # Of seven quantities two are not known: the odds are 2 to 7 that one of them is off.
@@ -510,41 +622,53 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
 @pytest.mark.parametrize('size, row', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])
 def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
     """A remark, no finding of its own."""
-    fault, = assessed(calibration(deviation(offset=size), SIGMA)).faults
+    (fault,) = assessed(calibration(deviation(offset=size), SIGMA)).faults
     assert fault.quantity == 'time_offset'
     assert ('stamp_row' in fault.fix) is bool(row)
     assert not row or f'(stamp_row: {row} is equivalent)' in fault.fix
 
 
-@pytest.mark.parametrize('size, state', [
-    (0.0, 'ok'), (2.5e-3, 'ok'), (0.01, 'suspect'), (0.03, 'wrong')])
+@pytest.mark.parametrize(
+    'size, state', [(0.0, 'ok'), (2.5e-3, 'ok'), (0.01, 'suspect'), (0.03, 'wrong')]
+)
 def test_the_state_follows_the_shift_of_the_pose(size, state):
     health = assessed(calibration(deviation(offset=size), SIGMA))
     assert health.state is FindingState(state)
-    finding, = (one for one in health.findings if one.quantity == 'time_offset')
+    (finding,) = (one for one in health.findings if one.quantity == 'time_offset')
     assert (finding.configured, finding.estimated) == (
-        0.004, pytest.approx(0.004 + size, abs=1e-5))
+        0.004,
+        pytest.approx(0.004 + size, abs=1e-5),
+    )
     if state != 'ok':
         assert health.faults == (finding,)
         assert f'set time_offset: {0.004 + size:.4f}' in finding.fix
 
 
-@pytest.mark.parametrize('quantity, size, on, offered', [
-    ('offset', -0.03, False, True), ('offset', -0.03, True, False),
-    ('offset', -0.06, False, False),
-    ('readout', 0.008, False, True), ('readout', 0.008, True, False),
-    ('readout', 0.02, False, False)])
+@pytest.mark.parametrize(
+    'quantity, size, on, offered',
+    [
+        ('offset', -0.03, False, True),
+        ('offset', -0.03, True, False),
+        ('offset', -0.06, False, False),
+        ('readout', 0.008, False, True),
+        ('readout', 0.008, True, False),
+        ('readout', 0.02, False, False),
+    ],
+)
 def test_tracking_is_suggested_if_it_is_off_and_reaches_the_estimate(quantity, size, on, offered):
     tracking = {'offset': 'track_time_offset', 'readout': 'track_readout_time'}[quantity]
-    fault = assessed(calibration(deviation(**{quantity: size}), SIGMA),
-                     assessment.Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
-                     replace(CONFIGURED, sensor=sensor(**{tracking: on}))).faults[0]
+    fault = assessed(
+        calibration(deviation(**{quantity: size}), SIGMA),
+        assessment.Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
+        replace(CONFIGURED, sensor=sensor(**{tracking: on})),
+    ).faults[0]
     assert (f'{tracking}: true' in fault.fix) is offered
 
 
 def test_messages_have_no_negative_zero():
-    configured = replace(CONFIGURED, sensor=sensor(time_offset=0.0),
-                         gyro_bias=np.array([0.0, -1e-7, 0.0]))
+    configured = replace(
+        CONFIGURED, sensor=sensor(time_offset=0.0), gyro_bias=np.array([0.0, -1e-7, 0.0])
+    )
     health = assessed(calibration(deviation(offset=-1e-6), SIGMA), configured=configured)
     assert health.state is FindingState.OK
     assert not re.search(r'-0\.0*(\D|$)', health.text)
@@ -552,8 +676,12 @@ def test_messages_have_no_negative_zero():
 
 def test_gross_errors_leave_the_other_quantities_unknown():
     turned = rotations(Rotation.from_rotvec([1.5, 0.0, 0.0]).as_matrix()).compared()
-    health = assessment.assess(calibration(deviation(offset=0.03), SIGMA), [],
-                               assessment.gross_errors(turned, 0.0, CONFIGURED), CONFIGURED)
+    health = assessment.assess(
+        calibration(deviation(offset=0.03), SIGMA),
+        [],
+        assessment.gross_errors(turned, 0.0, CONFIGURED),
+        CONFIGURED,
+    )
     assert [finding.quantity for finding in health.faults] == ['axes']
     assert {finding.state for finding in health.findings[1:]} == {FindingState.UNKNOWN}
 
@@ -577,8 +705,15 @@ def test_the_worst_of_a_run():
     both = Assessment((finding('a', SUSPECT), finding('b', WRONG)))
     assert both.faults[0].quantity == 'b'
     assert json.loads(json.dumps(both.as_json()))['findings'][0] == {
-        'figure': 'a', 'told': 0.5, 'seen': 1.0, 'sigma': 0.1, 'unit': 's', 'observable': True,
-        'state': 'suspect', 'sentence': 'a: b'}
+        'figure': 'a',
+        'told': 0.5,
+        'seen': 1.0,
+        'sigma': 0.1,
+        'unit': 's',
+        'observable': True,
+        'state': 'suspect',
+        'sentence': 'a: b',
+    }
 
 
 def test_traces_of_a_gross_error_are_left_out_of_a_run():
@@ -592,6 +727,7 @@ def test_traces_of_a_gross_error_are_left_out_of_a_run():
 
 
 # -- tracked parameters --------------------------------------------------------------------------
+
 
 def tracked(offset=0.0, sigma=1e-3, readout=0.03):
     return Tracked(np.zeros(3), np.ones(3), offset, sigma, readout, sigma, 10)
@@ -622,9 +758,16 @@ def test_the_offset_is_applied_in_small_steps_and_taken_back():
     assert run_of(back[-1], tracked(-0.2), on, 80)[-1].time_offset == -0.05
 
 
-@pytest.mark.parametrize('configured, estimated, reached', [
-    (0.03, 0.034, 0.004), (0.03, 0.025, -0.005), (0.03, 0.06, 0.01), (0.03, -0.03, -0.01),
-    (0.004, -0.002, -0.004)])   # not negative
+@pytest.mark.parametrize(
+    'configured, estimated, reached',
+    [
+        (0.03, 0.034, 0.004),
+        (0.03, 0.025, -0.005),
+        (0.03, 0.06, 0.01),
+        (0.03, -0.03, -0.01),
+        (0.004, -0.002, -0.004),
+    ],
+)  # not negative
 def test_the_readout_is_applied_as_far_as_frames_cover_it(configured, estimated, reached):
     on = sensor(track_readout_time=True, readout_time=configured)
     run = run_of(Applied(), tracked(readout=estimated), on, 25)
@@ -644,12 +787,13 @@ def test_tracked_values_are_those_of_the_parameters(direction, sign):
     """The offset is that of the middle row, with the active readout time: 2 ms more."""
     camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
     active = deviation(readout=sign * 0.002)
-    configured = assessment.Configured(sensor(readout_direction=direction), camera,
-                                       np.full(3, 0.1), SIGMA, active)
+    configured = assessment.Configured(
+        sensor(readout_direction=direction), camera, np.full(3, 0.1), SIGMA, active
+    )
     c = deviation(offset=0.004, readout=sign * 0.006)
     c[BIAS] = 0.01, 0.02, 0.03
     estimated = Tracked.of(calibration(c, SIGMA), configured)
-    share = 0.5 * 479 / 480   # the stamped row is row 0
+    share = 0.5 * 479 / 480  # the stamped row is row 0
     assert estimated.readout_time == pytest.approx(0.036)
     assert estimated.time_offset == pytest.approx(0.004 + 0.004 + share * sign * 0.004)
     np.testing.assert_allclose(estimated.gyro_bias, [0.11, 0.12, 0.13])
@@ -660,9 +804,11 @@ def test_pairs_that_contradict_the_accelerometer():
     sums, stamps = AccelerationSums(), itertools.count(0, 1000 * MS)
     # Number of pairs of such evidence, and a part of the fix then; None: no finding yet.
     for pairs, evidence, fix in (
-            (3, (-50.0, -80.0), None),   # one pair does not decide, however strong
-            (1, (-50.0, 0.5), 'correct the driver'), (7, (-1.0, 3.0), 'reverse its sign'),
-            (25, (1.0, -1.0), '')):   # and back, with the data
+        (3, (-50.0, -80.0), None),  # one pair does not decide, however strong
+        (1, (-50.0, 0.5), 'correct the driver'),
+        (7, (-1.0, 3.0), 'reverse its sign'),
+        (25, (1.0, -1.0), ''),
+    ):  # and back, with the data
         for _ in range(pairs):
             sums.add(next(stamps), InertialEvidence(*evidence))
         found = sums.finding()
@@ -673,18 +819,19 @@ def test_pairs_that_contradict_the_accelerometer():
 
 # -- wrong parameters, end to end: the bundled bag ------------------------------------------------
 
+
 @dataclass(frozen=True)
 class Wrong:
     """An error of the configuration, and the finding that it must have."""
 
     name: str
-    quantities: str   # either is right
+    quantities: str  # either is right
     parameters: tuple[str, ...] = ()
-    change: tuple[Role, object] | None = None   # of messages
-    estimated: float | None = None   # true value of the quantity, in its unit
+    change: tuple[Role, object] | None = None  # of messages
+    estimated: float | None = None  # true value of the quantity, in its unit
     tolerance: float = 0.0
-    stamps_late: float = 0.0   # [s] the IMU clock, as configured, minus that of the truth
-    pairs: int | None = None   # end of the run
+    stamps_late: float = 0.0  # [s] the IMU clock, as configured, minus that of the truth
+    pairs: int | None = None  # end of the run
 
 
 UNCHANGED = np.eye(3)
@@ -692,8 +839,10 @@ UNCHANGED = np.eye(3)
 
 def camera_with(**factors):
     """Intrinsics times some factors; of a tuple, 0 is none."""
-    return Role.CAMERA_INFO, lambda configured: replace(configured, **{
-        name: factor * getattr(configured, name) for name, factor in factors.items()})
+    return Role.CAMERA_INFO, lambda configured: replace(
+        configured,
+        **{name: factor * getattr(configured, name) for name, factor in factors.items()},
+    )
 
 
 def imu_with(axes=UNCHANGED, gyro=1.0, late=0.0, force=UNCHANGED):
@@ -701,35 +850,57 @@ def imu_with(axes=UNCHANGED, gyro=1.0, late=0.0, force=UNCHANGED):
 
     `force` (3, 3): factor of the accelerometer.
     """
+
     def changed(sample):
         rate, specific = sample.angular_velocity, sample.linear_acceleration
         return replace(
-            sample, stamp_ns=sample.stamp_ns + round(1e9 * late),
+            sample,
+            stamp_ns=sample.stamp_ns + round(1e9 * late),
             angular_velocity=None if rate is None else tuple(gyro * axes @ np.array(rate)),
-            linear_acceleration=None if specific is None else tuple(
-                force @ axes @ np.array(specific)))
+            linear_acceleration=None
+            if specific is None
+            else tuple(force @ axes @ np.array(specific)),
+        )
+
     return Role.IMU, changed
 
 
 CYCLED = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
 ROTATED = Rotation.from_rotvec(np.radians([2.0, -1.7, 1.5]))
 WRONG_ONES = [
-    Wrong('offset', 'time_offset', ('time_offset=0.01',), None, 0.0, 1e-3, stamps_late=0.01,
-          pairs=20),
+    Wrong(
+        'offset', 'time_offset', ('time_offset=0.01',), None, 0.0, 1e-3, stamps_late=0.01, pairs=20
+    ),
     # Far from the configuration a pair is not linear: more are needed.
     Wrong('late', 'time_offset', (), imu_with(late=0.03), 0.03, 1e-3, pairs=26),
     Wrong('no readout', 'readout_time', ('readout_time=0.0',), None, 0.03, 1e-3, pairs=14),
     Wrong('up', 'readout_direction', ('readout_direction=up',), None, -0.03, 1e-3, pairs=14),
-    Wrong('bias', 'gyro_bias', ('gyro_bias=[0.06,0,0]', 'track_gyro_bias=false'), None, 0.010885,
-          5e-4, pairs=8),
+    Wrong(
+        'bias',
+        'gyro_bias',
+        ('gyro_bias=[0.06,0,0]', 'track_gyro_bias=false'),
+        None,
+        0.010885,
+        5e-4,
+        pairs=8,
+    ),
     # No pose before it is detected: each pair is LOW_PARALLAX.
     Wrong('axes cycled', 'axes', (), imu_with(CYCLED), pairs=26),
-    Wrong('axes by 3 deg', 'axes', (), imu_with(ROTATED.as_matrix()),
-          math.degrees(ROTATED.magnitude()), 0.1, pairs=14),
+    Wrong(
+        'axes by 3 deg',
+        'axes',
+        (),
+        imu_with(ROTATED.as_matrix()),
+        math.degrees(ROTATED.magnitude()),
+        0.1,
+        pairs=14,
+    ),
     Wrong('gyro 0.95', 'gyro_scale', (), imu_with(gyro=1.0 / 0.95), 0.95, 3e-3, pairs=14),
     Wrong('K 1.3', 'focal_length', (), camera_with(fx=1.3, fy=1.3), 450.0, 5.0, pairs=12),
     Wrong('acceleration, other sign', 'accel_axes', (), imu_with(force=-UNCHANGED), pairs=20),
 ]
+
+
 def replayed(bag_path, *assignments, pairs=None, stamps=None):
     """Results of the pairs, and the true trajectory."""
     parameters = read_parameters(bag_path.with_name('hand_held.yaml'), assignments)
@@ -745,10 +916,12 @@ def beyond_covariance(result, truth, late_ns):
     pose = result.pose
     R, t = truth.relative_pose(result.reference_ns1 - late_ns, result.reference_ns2 - late_ns)
     turn = Rotation.from_matrix(R @ pose.R.T).as_rotvec()
-    across = np.linalg.svd(pose.t[None])[2][1:]   # of t: a direction
+    across = np.linalg.svd(pose.t[None])[2][1:]  # of t: a direction
     off = across @ (t / np.linalg.norm(t))
-    return (turn @ np.linalg.solve(pose.covariance[3:, 3:], turn) / 21.1,
-            off @ np.linalg.solve(across @ pose.covariance[:3, :3] @ across.T, off) / 18.4)
+    return (
+        turn @ np.linalg.solve(pose.covariance[3:, 3:], turn) / 21.1,
+        off @ np.linalg.solve(across @ pose.covariance[:3, :3] @ across.T, off) / 18.4,
+    )
 
 
 @pytest.mark.parametrize('case', WRONG_ONES, ids=lambda case: case.name)
@@ -756,27 +929,36 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
     if case.change is not None:
         role, change = case.change
         part = incoming.PARTS[role]
-        monkeypatch.setitem(incoming.PARTS, role, incoming.Part(
-            part.msgtypes, lambda message: change(part.read(message))))
+        monkeypatch.setitem(
+            incoming.PARTS,
+            role,
+            incoming.Part(part.msgtypes, lambda message: change(part.read(message))),
+        )
     results, truth = replayed(bundled_bag, *case.parameters, pairs=case.pairs)
     right = set(case.quantities.split())
     # Of a wrong gyro the accelerometer reveals nothing but a contradiction.
-    flagged = [k for k, result in enumerate(results) if {
-        fault.quantity for fault in result.health.faults} - ({'accel_axes'} - right)]
+    flagged = [
+        k
+        for k, result in enumerate(results)
+        if {fault.quantity for fault in result.health.faults} - ({'accel_axes'} - right)
+    ]
     assert flagged, 'no finding'
     named = [[fault.quantity for fault in results[k].health.faults] for k in (flagged[0], -1)]
     assert any(len(names) <= 2 and right & set(names) for names in named), named
     if case.estimated is not None:
-        fault = next(fault for fault in results[flagged[-1]].health.faults
-                     if fault.quantity in right)
-        assert fault.estimated == pytest.approx(case.estimated,
-                                                abs=4.0 * fault.sigma + case.tolerance)
+        fault = next(
+            fault for fault in results[flagged[-1]].health.faults if fault.quantity in right
+        )
+        assert fault.estimated == pytest.approx(
+            case.estimated, abs=4.0 * fault.sigma + case.tolerance
+        )
     for k, result in enumerate(results):
         state, pose = result.health.state, result.pose
         if state is FindingState.WRONG:
             assert not pose
             assert result.health.faults[0].text == pose.reason or (
-                pose.status is not Status.WITHHELD)
+                pose.status is not Status.WITHHELD
+            )
         if pose and k >= flagged[0]:
             assert max(beyond_covariance(result, truth, round(1e9 * case.stamps_late))) < 1.0, k
 
@@ -815,8 +997,9 @@ def test_correctly_configured_nothing_is_found(correct):
 
 
 def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypatch):
-    monkeypatch.setattr(ConsistencyMonitor, 'add_pair',
-                        lambda self, stamp_ns, data, pose, configured: pose)
+    monkeypatch.setattr(
+        ConsistencyMonitor, 'add_pair', lambda self, stamp_ns, data, pose, configured: pose
+    )
     without, _ = replayed(bundled_bag)
     assert len(without) == len(correct)
     for a, b in zip(without, correct, strict=True):
@@ -824,8 +1007,11 @@ def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypa
         for name in ('R', 't'):
             assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
     # Before the first pair nothing is verified; later it is.
-    wider = [np.trace(b.pose.covariance[3:, 3:]) / np.trace(a.pose.covariance[3:, 3:])
-             for a, b in zip(without, correct, strict=True) if a.pose]
+    wider = [
+        np.trace(b.pose.covariance[3:, 3:]) / np.trace(a.pose.covariance[3:, 3:])
+        for a, b in zip(without, correct, strict=True)
+        if a.pose
+    ]
     assert min(wider) >= 1.0
     assert wider[0] > 4.0
     assert max(wider[10:]) < 1.2
@@ -834,13 +1020,26 @@ def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypa
 def estimated_pairs(c, count):
     """Pairs of a flight with their estimated poses, as the monitor gets them."""
     for k, pair in enumerate(flight(c, count)):
-        yield 400 * MS * k, pair, estimate_relative_pose(
-            pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
-            pair.gyro_rotation, pair.gyro_covariance, pair.interval, EstimatorConfig())
+        yield (
+            400 * MS * k,
+            pair,
+            estimate_relative_pose(
+                pair.points1,
+                pair.points2,
+                pair.camera,
+                pair.motion1,
+                pair.motion2,
+                pair.gyro_rotation,
+                pair.gyro_covariance,
+                pair.interval,
+                EstimatorConfig(),
+            ),
+        )
 
 
-@pytest.mark.parametrize('c', [deviation(focal=-0.03), deviation(readout=0.004)],
-                         ids=['focal', 'readout'])
+@pytest.mark.parametrize(
+    'c', [deviation(focal=-0.03), deviation(readout=0.004)], ids=['focal', 'readout']
+)
 def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
     """From the first pair on, with the configured rotation of the gyro, and without a fault."""
     monitor, alone, within = ConsistencyMonitor(), 0.0, 0.0
@@ -856,19 +1055,27 @@ def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
 
 # -- errors that the tracks of a pair share ------------------------------------------------------
 
+
 def agreeing_pairs(scatter, count=60, seed=0, frames=5, gyro_square=0.0):
     """Poses of a straight motion, directions at the ends off by `scatter` times their sigma."""
     rng, sigma = np.random.default_rng(seed), 0.01
     for _ in range(count):
         ends = np.array([0.0, 0.0, 4.0]) + [1.0, 1.0, 0.0] * (
-            4.0 * scatter * sigma * rng.normal(size=(2, 3)))
-        spread = np.diag([1.0, 1.0, 4.0]) * (4.0 * sigma)**2
+            4.0 * scatter * sigma * rng.normal(size=(2, 3))
+        )
+        spread = np.diag([1.0, 1.0, 4.0]) * (4.0 * sigma) ** 2
         yield RelativePose(
-            Status.OK, R=np.eye(3), t=np.array([0.0, 0.0, 1.0]), frames=frames,
-            linear_velocity1=ends[0], linear_velocity2=ends[1], gyro_square=gyro_square,
+            Status.OK,
+            R=np.eye(3),
+            t=np.array([0.0, 0.0, 1.0]),
+            frames=frames,
+            linear_velocity1=ends[0],
+            linear_velocity2=ends[1],
+            gyro_square=gyro_square,
             linear_velocity1_covariance=spread if frames > 2 else np.full((3, 3), np.nan),
-            covariance=np.diag([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]), velocity_covariance=np.diag(
-                [*np.diag(spread), 1.0, 1.0, 1.0]))
+            covariance=np.diag([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]),
+            velocity_covariance=np.diag([*np.diag(spread), 1.0, 1.0, 1.0]),
+        )
 
 
 def factors(poses, gap=0, doubt=0.0):
@@ -885,8 +1092,10 @@ def factors(poses, gap=0, doubt=0.0):
         expected = by * pose.covariance
         expected[3, 3] = max(expected[3, 3], assessed.covariance[3, 3])
         np.testing.assert_allclose(out.covariance, expected, atol=1e-12)
-        np.testing.assert_allclose(np.diag(out.velocity_covariance) / np.diag(
-            pose.velocity_covariance), [by] * 3 + [1.0] * 3)
+        np.testing.assert_allclose(
+            np.diag(out.velocity_covariance) / np.diag(pose.velocity_covariance),
+            [by] * 3 + [1.0] * 3,
+        )
         for name in ('R', 't', 'linear_velocity1', 'linear_velocity2'):
             assert np.array_equal(getattr(out, name), getattr(pose, name))
         found.append(by)
@@ -904,8 +1113,11 @@ def test_pairs_that_disagree_enlarge_the_covariances_of_later_ones():
         np.testing.assert_allclose(factors(agreeing_pairs(scatter), doubt=3.0), found)
     # One wrong pose spoils two comparisons only, which are bounded.
     poses = list(agreeing_pairs(0.7))
-    poses[20] = replace(poses[20], linear_velocity1=np.array([4.0, 0.0, 0.5]),
-                        linear_velocity2=np.array([4.0, 0.0, 0.5]))
+    poses[20] = replace(
+        poses[20],
+        linear_velocity1=np.array([4.0, 0.0, 0.5]),
+        linear_velocity2=np.array([4.0, 0.0, 0.5]),
+    )
     found = factors(poses)
     assert 1.5 < found[21] < 4.0 and found[-1] < 0.6 * found[21]
 
@@ -924,34 +1136,68 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
 
 # -- tracked parameters, on the bundled bag ------------------------------------------------------
 
+
 # Parameters, and what is estimated and applied at the end, with the largest errors of both.
-@pytest.mark.parametrize(('assignments', 'name', 'estimated', 'applied', 'errors', 'sigmas'), [
-    # The bag was written with a bias of (0.011, -0.007, 0.005) rad/s, an offset of 0, and a
-    # readout time of 30 ms.
-    (('time_offset=0.01', 'gyro_bias=[0.0, 0.0, 0.0]', 'gyro_bias_sigma=0.01',
-      'track_time_offset=true'), 'time_offset', 0.0, -0.01, 1e-3, 1.2),
-    # 0.51 ms off with OpenCV 4.6.
-    (('readout_time=0.034', 'track_readout_time=true'), 'readout_time', 0.03, -0.004, 6e-4, 1.0)])
-def test_wrong_parameters_are_tracked(bundled_bag, assignments, name, estimated, applied, errors,
-                                      sigmas):
+@pytest.mark.parametrize(
+    ('assignments', 'name', 'estimated', 'applied', 'errors', 'sigmas'),
+    [
+        # The bag was written with a bias of (0.011, -0.007, 0.005) rad/s, an offset of 0, and a
+        # readout time of 30 ms.
+        (
+            (
+                'time_offset=0.01',
+                'gyro_bias=[0.0, 0.0, 0.0]',
+                'gyro_bias_sigma=0.01',
+                'track_time_offset=true',
+            ),
+            'time_offset',
+            0.0,
+            -0.01,
+            1e-3,
+            1.2,
+        ),
+        # 0.51 ms off with OpenCV 4.6.
+        (
+            ('readout_time=0.034', 'track_readout_time=true'),
+            'readout_time',
+            0.03,
+            -0.004,
+            6e-4,
+            1.0,
+        ),
+    ],
+)
+def test_wrong_parameters_are_tracked(
+    bundled_bag, assignments, name, estimated, applied, errors, sigmas
+):
     last = replayed(bundled_bag, *assignments)[0][-1]
     assert np.abs(last.tracked.gyro_bias - [0.011, -0.007, 0.005]).max() < 1e-3
     assert getattr(last.tracked, name) == pytest.approx(estimated, abs=errors)
-    assert abs(getattr(last.tracked, name) - estimated) / sigmas < getattr(
-        last.tracked, f'{name}_sigma') < 1e-3
+    assert (
+        abs(getattr(last.tracked, name) - estimated) / sigmas
+        < getattr(last.tracked, f'{name}_sigma')
+        < 1e-3
+    )
     assert getattr(last.applied, name) == pytest.approx(applied, abs=errors)
     assert last.health.state is FindingState.OK
 
 
 def test_live_and_replay_agree_while_tracking(bundled_bag):
     """Frames are lost at random, as live; the replay of the processed ones has equal bits."""
-    settings = ('time_offset=0.01', 'readout_time=0.027', 'track_time_offset=true',
-                'track_readout_time=true')
+    settings = (
+        'time_offset=0.01',
+        'readout_time=0.027',
+        'track_time_offset=true',
+        'track_readout_time=true',
+    )
     front_end = FrontEnd(read_parameters(bundled_bag.with_name('hand_held.yaml'), settings))
     sequencer = front_end.sequencer
     processed, failed = [], []
-    worker = Worker(front_end, lambda: None, lambda outcome: (
-        processed if isinstance(outcome, Frame) else failed).append(outcome))
+    worker = Worker(
+        front_end,
+        lambda: None,
+        lambda outcome: (processed if isinstance(outcome, Frame) else failed).append(outcome),
+    )
     worker.start()
     assert worker.warm.wait(60.0)
     intake, rng, images = Intake(sequencer), np.random.default_rng(5), 0
@@ -967,16 +1213,22 @@ def test_live_and_replay_agree_while_tracking(bundled_bag):
                     time.sleep(0.002)
                     if sequencer.counts().refused:
                         break
-    while worker.is_alive() and len(processed) < images - sum(
-            sequencer.counts().refused.values()) - 1:
+    while (
+        worker.is_alive()
+        and len(processed) < images - sum(sequencer.counts().refused.values()) - 1
+    ):
         time.sleep(0.05)
     assert worker.stop(30.0)
     assert not any(isinstance(outcome, FrameFailed) for outcome in failed)
     live = [frame.result for frame in processed if frame.result is not None]
     assert live[-1].applied.time_offset < -0.005
     assert live[-1].applied.readout_time > 0.001
-    again, _ = replayed(bundled_bag, *settings, pairs=len(live), stamps=frozenset(
-        frame.stamp_ns for frame in processed))
+    again, _ = replayed(
+        bundled_bag,
+        *settings,
+        pairs=len(live),
+        stamps=frozenset(frame.stamp_ns for frame in processed),
+    )
     assert len(again) == len(live)
     for a, b in zip(live, again, strict=True):
         assert (a.reference_stamp_ns, a.stamp_ns) == (b.reference_stamp_ns, b.stamp_ns)

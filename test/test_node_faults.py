@@ -79,39 +79,66 @@ FAULTS = [
     Fault('IMU gap inside a frame', faults.without(Imu, 0.52, 0.58), GAP),
     Fault('clocks back', faults.nothing, jump=-20.0),
     Fault('clocks ahead', faults.nothing, GAP, jump=20.0),
-    Fault('clocks back by less than a second', faults.nothing, 'older than the one before',
-          jump=-0.4),
+    Fault(
+        'clocks back by less than a second', faults.nothing, 'older than the one before', jump=-0.4
+    ),
     Fault('one image far ahead', faults.first_ahead(Image, 100.0), 'no other is near it'),
     Fault('one IMU sample far ahead', faults.first_ahead(Imu, 100.0)),
     Fault('camera stops', faults.without(Image)),
     Fault('camera slows down', faults.every(Image, 3)),
     Fault('image and CameraInfo are cropped', faults.changed((Image, CameraInfo), cropped)),
-    Fault('image is smaller', faults.changed(Image, faults.pixels(lambda i: i[::2, ::2])),
-          'image is 320x240, but its CameraInfo is for 640x480'),
-    Fault('unknown encoding', faults.changed(Image, put('encoding', 'mono12')),
-          "image encoding 'mono12' is not known; publish one of mono8"),
+    Fault(
+        'image is smaller',
+        faults.changed(Image, faults.pixels(lambda i: i[::2, ::2])),
+        'image is 320x240, but its CameraInfo is for 640x480',
+    ),
+    Fault(
+        'unknown encoding',
+        faults.changed(Image, put('encoding', 'mono12')),
+        "image encoding 'mono12' is not known; publish one of mono8",
+    ),
     Fault('CameraInfo stops', faults.without(CameraInfo)),
-    Fault('CameraInfo uncalibrated', faults.changed(CameraInfo, put('k', np.zeros(9))),
-          'the camera is uncalibrated (k[0] of its CameraInfo is 0)'),
-    Fault('unknown distortion model', faults.changed(
-        CameraInfo, put('distortion_model', 'double_sphere')),
-          'distortion_model must be one of plumb_bob, rational_polynomial, equidistant, got '
-          "'double_sphere'"),
+    Fault(
+        'CameraInfo uncalibrated',
+        faults.changed(CameraInfo, put('k', np.zeros(9))),
+        'the camera is uncalibrated (k[0] of its CameraInfo is 0)',
+    ),
+    Fault(
+        'unknown distortion model',
+        faults.changed(CameraInfo, put('distortion_model', 'double_sphere')),
+        'distortion_model must be one of plumb_bob, rational_polynomial, equidistant, got '
+        "'double_sphere'",
+    ),
     Fault('every message twice', faults.twice, 'a frame of this stamp came before'),
-    Fault('messages overtake each other', faults.delayed(
-        object, lambda: float(_rng.uniform(0.0, 0.04)))),
+    Fault(
+        'messages overtake each other',
+        faults.delayed(object, lambda: float(_rng.uniform(0.0, 0.04))),
+    ),
     Fault('late IMU', faults.delayed(Imu, lambda: 0.3)),
     Fault('late images', faults.delayed(Image, lambda: 0.3)),
     Fault('NaN', faults.changed(Imu, nan), 'angular_velocity of an IMU message must be finite'),
     Fault('IMU of zeros', faults.changed(Imu, zero), HANGS),
     Fault('IMU hangs', faults.changed(Imu, faults.repeating(lambda m: m, hang_imu)), HANGS),
-    Fault('gyro saturated', faults.changed(Imu, faults.vector('angular_velocity', z=4.36)),
-          'the z axis of the gyro repeats 4.36 rad/s bit by bit: it is saturated'),
-    Fault('accelerometer saturated', faults.changed(
-        Imu, faults.vector('linear_acceleration', x=39.2))),
+    Fault(
+        'gyro saturated',
+        faults.changed(Imu, faults.vector('angular_velocity', z=4.36)),
+        'the z axis of the gyro repeats 4.36 rad/s bit by bit: it is saturated',
+    ),
+    Fault(
+        'accelerometer saturated',
+        faults.changed(Imu, faults.vector('linear_acceleration', x=39.2)),
+    ),
     Fault('black', faults.changed(Image, faults.pixels(np.zeros_like)), SAME),
-    Fault('frozen', faults.changed(Image, faults.repeating(
-        faults.pixels_of, lambda m, first: faults.gray_image(m.header, first))), SAME),
+    Fault(
+        'frozen',
+        faults.changed(
+            Image,
+            faults.repeating(
+                faults.pixels_of, lambda m, first: faults.gray_image(m.header, first)
+            ),
+        ),
+        SAME,
+    ),
     Fault('blurred', faults.changed(Image, blurred(4.0))),
     Fault('blurred beyond use', faults.changed(Image, blurred(20.0))),
     Fault('the end', faults.nothing),
@@ -134,11 +161,16 @@ def truth(bundled_bag: Path) -> TrueTrajectory:
 @pytest.fixture(scope='module')
 def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleNamespace]:
     """What the node published and wrote while all phases were played."""
-    stream = Stream(faults.read_messages(bundled_bag, faults.PHASE + 0.1, every=2), FAULTS,
-                    FIRST_STAMP_NS)
+    stream = Stream(
+        faults.read_messages(bundled_bag, faults.PHASE + 0.1, every=2), FAULTS, FIRST_STAMP_NS
+    )
     last = len(FAULTS) - 1
-    with Graph() as graph, node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={
-            'image_transport': 'raw'}) as process:
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={'image_transport': 'raw'}
+        ) as process,
+    ):
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         references = graph.listen(TimeReference, '/relpose_node/reference')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
@@ -147,8 +179,12 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
         publishers = [faults.drivers(graph, best_effort=kinds) for kinds in ((), faults.TOPIC_OF)]
 
         def play(phases: range, enough: int = 2) -> None:
-            stream.play(lambda phase, message: publishers[phase % 2][type(message)].publish(
-                message), poses, phases, enough)
+            stream.play(
+                lambda phase, message: publishers[phase % 2][type(message)].publish(message),
+                poses,
+                phases,
+                enough,
+            )
 
         play(range(3))
         memory = resident(process.pid)
@@ -161,31 +197,51 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
         count = len(diagnostics)
         wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
         # On a busy machine debug images hold up what comes with them; it is sent again.
-        wait_until(lambda: min(len(poses), len(references)) >= int(
-            diagnostic_values(diagnostics[-1])['poses']), 'all poses', timeout=30.0)
+        wait_until(
+            lambda: (
+                min(len(poses), len(references))
+                >= int(diagnostic_values(diagnostics[-1])['poses'])
+            ),
+            'all poses',
+            timeout=30.0,
+        )
         print(process.output)
         yield SimpleNamespace(
-            stream=stream, poses=list(poses), references={
-                faults.stamp_of(item): time_ns(item.time_ref) for item in references},
-            values=diagnostic_values(diagnostics[-1]), output=process.output,
-            memory_growth=growth, restarted=restarted, debug_images=list(debug_images))
+            stream=stream,
+            poses=list(poses),
+            references={faults.stamp_of(item): time_ns(item.time_ref) for item in references},
+            values=diagnostic_values(diagnostics[-1]),
+            output=process.output,
+            memory_growth=growth,
+            restarted=restarted,
+            debug_images=list(debug_images),
+        )
 
 
-def wrong(message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int,
-          truth: TrueTrajectory) -> str:
+def wrong(
+    message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int, truth: TrueTrajectory
+) -> str:
     """How a pose is wrong: by more than its covariance claims, and enough to do harm."""
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    errors = truth.errors(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
-                          np.array([position.x, position.y, position.z]), begin_ns, end_ns)
+    errors = truth.errors(
+        Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
+        np.array([position.x, position.y, position.z]),
+        begin_ns,
+        end_ns,
+    )
     assert errors is not None
     variances = np.diag(np.reshape(message.pose.covariance, (6, 6)))
-    translation_sigma, rotation_sigma = np.degrees(np.sqrt(
-        [variances[:3].sum(), variances[3:].sum()]))
-    if (errors.rotation_error <= max(1.0, 4.0 * rotation_sigma)
-            and errors.translation_error <= max(5.0, 4.0 * translation_sigma)):
+    translation_sigma, rotation_sigma = np.degrees(
+        np.sqrt([variances[:3].sum(), variances[3:].sum()])
+    )
+    if errors.rotation_error <= max(1.0, 4.0 * rotation_sigma) and errors.translation_error <= max(
+        5.0, 4.0 * translation_sigma
+    ):
         return ''
-    return (f'rotation by {errors.rotation_error:.3f} deg (sigma {rotation_sigma:.3f}), '
-            f'translation by {errors.translation_error:.2f} deg (sigma {translation_sigma:.2f})')
+    return (
+        f'rotation by {errors.rotation_error:.3f} deg (sigma {rotation_sigma:.3f}), '
+        f'translation by {errors.translation_error:.2f} deg (sigma {translation_sigma:.2f})'
+    )
 
 
 @pytest.mark.parametrize('name', [fault.name for fault in FAULTS])
@@ -220,9 +276,11 @@ def test_no_wrong_pose_is_published(session, truth):
         how = wrong(message, begin_ns, end_ns, truth)
         if how:
             phases = [FAULTS[stream.phase_of[item]].name for item in (reference, stamp)]
-            found.append(f'{phases[0]} to {phases[1]}: images of '
-                         f'{(begin_ns - stream.bag_start_ns) / SECOND:.3f} s and '
-                         f'{(end_ns - stream.bag_start_ns) / SECOND:.3f} s: {how}')
+            found.append(
+                f'{phases[0]} to {phases[1]}: images of '
+                f'{(begin_ns - stream.bag_start_ns) / SECOND:.3f} s and '
+                f'{(end_ns - stream.bag_start_ns) / SECOND:.3f} s: {how}'
+            )
     assert found == []
     assert checked > 3 * len(FAULTS)
 
@@ -239,25 +297,38 @@ def test_nothing_else_is_reported(session):
     # While clocks and sensors change, frames wait in vain, come late or in between; where the
     # machine is slow the first phase, without CameraInfo, lasts until the node says so.
     # A saturated accelerometer is no specific force.
-    said += ['accel_scale is suspect', 'newer frames wait for the gyro',
-             'no gyro sample that covers', '(overload)', 'frame is ',
-             'stamps jumped', 'image is ', '(reset)', 'no CameraInfo on ']
+    said += [
+        'accel_scale is suspect',
+        'newer frames wait for the gyro',
+        'no gyro sample that covers',
+        '(overload)',
+        'frame is ',
+        'stamps jumped',
+        'image is ',
+        '(reset)',
+        'no CameraInfo on ',
+    ]
     assert [line for line in configured(session) if not any(text in line for text in said)] == []
     assert 'Traceback' not in session.output
 
 
 def configured(session: SimpleNamespace) -> list[str]:
     """Warnings and errors of the log."""
-    return [line for line in session.output.splitlines()
-            if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
+    return [
+        line for line in session.output.splitlines() if re.match(r'\[(WARN|ERROR|FATAL)\]', line)
+    ]
 
 
 def test_diagnostics_count_what_happened(session):
     values = session.values
-    refused = {key.removeprefix('frames_refused_'): int(value) for key, value in values.items()
-               if key.startswith('frames_refused_')}
+    refused = {
+        key.removeprefix('frames_refused_'): int(value)
+        for key, value in values.items()
+        if key.startswith('frames_refused_')
+    }
     assert int(values['frames_received']) == int(values['frames_processed']) + sum(
-        refused.values())
+        refused.values()
+    )
     for reason in ('imu_gap', 'duplicate', 'out_of_order', 'bad_image', 'no_calibration'):
         assert refused[reason] > 0, reason
     assert int(values['imu_gaps']) >= 5
@@ -267,7 +338,11 @@ def test_diagnostics_count_what_happened(session):
     assert values['frames_failed'] == '0'
     assert int(values['poses']) == len(session.poses)
     assert values['last_reason_no_pose'].split(':')[0] in (
-        'TOO_FEW_MATCHES', 'NO_CONSENSUS', 'LOW_PARALLAX', 'PURE_ROTATION')
+        'TOO_FEW_MATCHES',
+        'NO_CONSENSUS',
+        'LOW_PARALLAX',
+        'PURE_ROTATION',
+    )
 
 
 def test_memory_stays(session):
@@ -291,7 +366,8 @@ def test_debug_images_show_pairs(session):
     assert min(stamps) > session.stream.good[-2][0]
     assert len([stamp for stamp in stamps if stamp > begin_ns]) >= 3
     assert {stamp for stamp in map(faults.stamp_of, session.poses) if stamp > begin_ns} <= set(
-        stamps)
+        stamps
+    )
     for message in session.debug_images:
         assert (message.encoding, message.width, message.step) == ('bgr8', 640, 1920)
         assert message.header.frame_id == 'camera_optical_frame'
@@ -300,4 +376,3 @@ def test_debug_images_show_pairs(session):
         # 270 tracks of some pixels each, and the caption.
         assert 1000 < colored < 30_000
         assert image[480:].max() == 255
-

@@ -38,16 +38,26 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope='module')
-def run(module_ros_domain_id: int, bundled_bag: Path,
-        tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+def run(
+    module_ros_domain_id: int, bundled_bag: Path, tmp_path_factory: pytest.TempPathFactory
+) -> SimpleNamespace:
     """What the node published while the bag was played, and what it wrote."""
     stamps_file = tmp_path_factory.mktemp('live') / 'stamps.txt'
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS,
+            remap=BAG_TOPICS,
+            parameters={
                 'stamps_file': stamps_file,
-                **faults.reliable(COMPRESSED_TOPIC, IMU_TOPIC)}) as node:
-        messages = {topic: graph.listen(message_class(kind), f'/relpose_node/{topic}')
-                    for topic, kind in PAIR_TOPICS.items()}
+                **faults.reliable(COMPRESSED_TOPIC, IMU_TOPIC),
+            },
+        ) as node,
+    ):
+        messages = {
+            topic: graph.listen(message_class(kind), f'/relpose_node/{topic}')
+            for topic, kind in PAIR_TOPICS.items()
+        }
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
         for topic in PAIR_TOPICS:
@@ -59,21 +69,31 @@ def run(module_ros_domain_id: int, bundled_bag: Path,
         wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics', node)
         code, seconds = node.signal(signal.SIGTERM)
         return SimpleNamespace(
-            messages=messages, diagnostics=diagnostics, output=node.output, exit_code=code,
-            seconds_to_end=seconds, stamps=[int(line) for line in stamps_file.read_text().split()])
+            messages=messages,
+            diagnostics=diagnostics,
+            output=node.output,
+            exit_code=code,
+            seconds_to_end=seconds,
+            stamps=[int(line) for line in stamps_file.read_text().split()],
+        )
 
 
 def test_poses_are_those_of_the_truth(run, bundled_bag):
     with open_bag(bundled_bag) as bag:
         truth = read_truth(bag, bag.find_topics())
     errors = []
-    for message, reference in zip(run.messages['relative_pose'], run.messages['reference'],
-                                  strict=True):
+    for message, reference in zip(
+        run.messages['relative_pose'], run.messages['reference'], strict=True
+    ):
         position, q = message.pose.pose.position, message.pose.pose.orientation
-        errors.append(truth.errors(
-            Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
-            np.array([position.x, position.y, position.z]), time_ns(reference.time_ref),
-            stamp_ns(message.header)))
+        errors.append(
+            truth.errors(
+                Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
+                np.array([position.x, position.y, position.z]),
+                time_ns(reference.time_ref),
+                stamp_ns(message.header),
+            )
+        )
     assert len(errors) >= 10
     # The project's own aim on this bag.
     assert np.median([error.rotation_error for error in errors]) <= 0.15
@@ -83,8 +103,12 @@ def test_poses_are_those_of_the_truth(run, bundled_bag):
 def test_replay_of_the_same_frames_is_bit_equal(run, bundled_bag):
     """All messages of all pairs, in the order of their stamps."""
     with open_bag(bundled_bag) as bag:
-        replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS),
-                        stamps=frozenset(run.stamps))
+        replay = Replay(
+            bag,
+            bag.find_topics(),
+            read_parameters(BUNDLED_PARAMETERS),
+            stamps=frozenset(run.stamps),
+        )
         replayed = [build.pair_messages(pair, message_class) for pair in replay.pairs()]
     for topic, published in run.messages.items():
         assert published == [messages[topic] for messages in replayed if topic in messages]
@@ -107,14 +131,23 @@ def test_diagnostics_count_all_frames(run):
     assert int(values['poses']) == len(run.messages['relative_pose']) <= int(values['pairs'])
     assert int(values['imu_samples']) == 1246
     assert (values['imu_gaps'], values['messages_invalid'], values['frames_failed']) == (
-        '0', '0', '0')
+        '0',
+        '0',
+        '0',
+    )
     assert values['model'] == 'uniform'
     assert 0.0 < float(values['inlier_ratio']) <= 1.0
     assert 0.0 < float(values['latency_p50_ms']) <= float(values['latency_p99_ms'])
     # The bag has a standstill and a pure rotation.
     assert values['last_reason_no_pose'].split(':')[0] in ('PURE_ROTATION', 'LOW_PARALLAX')
-    rates = [{key: float(value) for key, value in diagnostic_values(item).items()
-              if key.endswith('_rate_hz')} for item in run.diagnostics]
+    rates = [
+        {
+            key: float(value)
+            for key, value in diagnostic_values(item).items()
+            if key.endswith('_rate_hz')
+        }
+        for item in run.diagnostics
+    ]
     assert max(rate['image_rate_hz'] for rate in rates) == pytest.approx(30.0, abs=6.0)
     assert max(rate['imu_rate_hz'] for rate in rates) == pytest.approx(200.0, abs=40.0)
     times = [stamp_ns(item.header) for item in run.diagnostics]
@@ -129,12 +162,12 @@ def test_a_good_run_ends_well_and_says_little(run):
     assert 'Traceback' not in run.output
     # At most that the machine was busy, and that the player came late.
     assert run.output.count('(overload)') <= 1
-    assert run.output.count('[WARN]') == (run.output.count('(overload)')
-                                          + run.output.count('no image on'))
+    assert run.output.count('[WARN]') == (
+        run.output.count('(overload)') + run.output.count('no image on')
+    )
 
 
 # -- a signal ends the node at once and quietly, at any time ----------------------------
-
 
 
 def blocks(pid: int, number: int) -> bool:
@@ -190,17 +223,21 @@ def recorded(bundled_bag: Path) -> list[dict[str, Any]]:
     with open_bag(bundled_bag) as bag:
         replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS))
         pairs = [build.pair_messages(pair, message_class) for pair in replay.pairs()]
-        return [*pairs[:LOST], *pairs[LOST + 1:]]
+        return [*pairs[:LOST], *pairs[LOST + 1 :]]
 
 
 @pytest.fixture(scope='module')
 def chain(module_ros_domain_id: int, recorded: list[dict[str, Any]]) -> Iterator[SimpleNamespace]:
     """Paths that the example published, each with its last stamp, and its output."""
-    with Graph() as graph, Process(
-            str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example:
+    with (
+        Graph() as graph,
+        Process(str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example,
+    ):
         paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
-        publishers = {name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
-                      for name, kind in PAIR_TOPICS.items()}
+        publishers = {
+            name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
+            for name, kind in PAIR_TOPICS.items()
+        }
         graph.wait_for_publisher('/relpose_node/pose_chain/path')
         for count, pair in enumerate(recorded):
             # In any order: what belongs together has one stamp.
@@ -221,8 +258,11 @@ def test_each_pair_extends_a_path(chain):
 
 def test_a_restart_of_the_path_is_reported(chain):
     """Where a pair is missing; but not at the bag's standstill and pure rotation."""
-    paths = [path for path, later in zip(chain.paths, [*chain.paths[1:], None], strict=True)
-             if later is None or len(later.poses) <= len(path.poses)]
+    paths = [
+        path
+        for path, later in zip(chain.paths, [*chain.paths[1:], None], strict=True)
+        if later is None or len(later.poses) <= len(path.poses)
+    ]
     assert [len(path.poses) for path in paths] == [LOST + 1, len(chain.pairs) - LOST + 1]
     assert chain.output.count('a pair is missing: the path restarts, at another scale') == 1
     assert stamp_ns(paths[1].poses[0].header) > stamp_ns(paths[0].poses[-1].header)
@@ -240,8 +280,12 @@ def test_odometry_in_the_axes_of_px4():
     pose, twist = message.pose.pose, message.twist.twist
     message.pose.covariance = (root @ root.T).ravel()
     R, (p, v, w) = Rotation.random(random_state=1), rng.normal(size=(3, 3))
-    for vector, values in ((pose.position, p), (pose.orientation, R.as_quat()), (twist.linear, v),
-                           (twist.angular, w)):
+    for vector, values in (
+        (pose.position, p),
+        (pose.orientation, R.as_quat()),
+        (twist.linear, v),
+        (twist.angular, w),
+    ):
         for axis, value in zip('xyzw', values, strict=False):
             setattr(vector, axis, float(value))
     found = module.px4_fields(message)
@@ -251,19 +295,27 @@ def test_odometry_in_the_axes_of_px4():
     px4_R = Rotation.from_quat([q[1], q[2], q[3], q[0]])
     # A point of the body, in the world of PX4, by PX4's pose and by that of the message.
     point = rng.normal(size=3)
-    np.testing.assert_allclose(px4_R.apply(right_down @ point) + found['position'],
-                               right_down @ (R.apply(point) + p), atol=1e-6)
+    np.testing.assert_allclose(
+        px4_R.apply(right_down @ point) + found['position'],
+        right_down @ (R.apply(point) + p),
+        atol=1e-6,
+    )
     np.testing.assert_allclose(found['velocity'], right_down @ v, atol=1e-6)
     np.testing.assert_allclose(found['angular_velocity'], right_down @ w, atol=1e-6)
     # Variances of errors that are drawn from the covariance, in the body's axes of PX4.
     errors = rng.multivariate_normal(np.zeros(6), root @ root.T, 20_000)
-    np.testing.assert_allclose(found['position_variance'],
-                               (errors[:, :3] @ right_down).var(axis=0), rtol=0.05)
-    np.testing.assert_allclose(found['orientation_variance'], px4_R.apply(
-        errors[:, 3:] @ right_down, inverse=True).var(axis=0), rtol=0.05)
+    np.testing.assert_allclose(
+        found['position_variance'], (errors[:, :3] @ right_down).var(axis=0), rtol=0.05
+    )
+    np.testing.assert_allclose(
+        found['orientation_variance'],
+        px4_R.apply(errors[:, 3:] @ right_down, inverse=True).var(axis=0),
+        rtol=0.05,
+    )
 
 
 # -- the live benchmark -------------------------------------------------------------------------
+
 
 def test_frame_timings_name_what_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match=r'timings_file .* cannot be written'):
@@ -275,8 +327,14 @@ def test_a_run_and_its_report(tmp_path, ros_domain_id, monkeypatch):
     monkeypatch.setattr(live_clip, 'PERIOD', 2.0)
     cell, seconds = live.LiveCell(320, 240, 'bgr8', 200), []
     clip = live_clip.prepare_clip(tmp_path, cell.width, cell.height)
-    found, over_time = live.run_cell(cell, clip, 3.0, tmp_path / cell.name,
-                                     ROOT / 'config' / 'fastdds.xml', lambda: seconds.append(1))
+    found, over_time = live.run_cell(
+        cell,
+        clip,
+        3.0,
+        tmp_path / cell.name,
+        ROOT / 'config' / 'fastdds.xml',
+        lambda: seconds.append(1),
+    )
     # The last two images would have no IMU.
     assert (found.frames_sent, found.imu_sent) == (90 - 2, 600)
     assert found.frames_received <= found.frames_sent

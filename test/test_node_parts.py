@@ -48,8 +48,10 @@ def test_a_reason_is_logged_once_and_later_with_its_number(clock):
     for now, number in ((31, 7), (62, 8)):
         clock.now = now
         log(f'image has {number} bytes')
-    assert lines[2:] == ['image has 7 bytes (4 more since the last such line)',
-                         'image has 8 bytes']
+    assert lines[2:] == [
+        'image has 7 bytes (4 more since the last such line)',
+        'image has 8 bytes',
+    ]
 
 
 def test_ever_new_reasons_do_not_fill_log_or_memory(clock):
@@ -65,22 +67,41 @@ class Lines(list[tuple[str, str]]):
     """Level and text of the lines of a `HealthLog`."""
 
     def __init__(self, clock: Clock) -> None:
-        self.log = diagnostics.HealthLog(*(
-            diagnostics.ReasonLog(lambda text, level=level: self.append((level, text)),
-                                  clock=clock)
-            for level in ('info', 'warn', 'error')))
+        self.log = diagnostics.HealthLog(
+            *(
+                diagnostics.ReasonLog(
+                    lambda text, level=level: self.append((level, text)), clock=clock
+                )
+                for level in ('info', 'warn', 'error')
+            )
+        )
 
 
 def finding(state: FindingState, ms: float, quantity: str = 'time_offset') -> Finding:
-    return Finding(quantity, state, f'estimated {ms} ms, active 30.0 ms',
-                   f'set {quantity}: {1e-3 * ms}', 0.03, 1e-3 * ms, 0.0005, 's', True)
+    return Finding(
+        quantity,
+        state,
+        f'estimated {ms} ms, active 30.0 ms',
+        f'set {quantity}: {1e-3 * ms}',
+        0.03,
+        1e-3 * ms,
+        0.0005,
+        's',
+        True,
+    )
 
 
 def test_health_is_logged_once_a_quantity_and_when_it_is_ok_again(clock):
     lines = Lines(clock)
     ok, unknown, suspect, wrong = (Assessment((finding(state, 0.2),)) for state in FindingState)
-    for health in (unknown, ok, suspect, Assessment((finding(FindingState.SUSPECT, 1.5),)), wrong,
-                   wrong):
+    for health in (
+        unknown,
+        ok,
+        suspect,
+        Assessment((finding(FindingState.SUSPECT, 1.5),)),
+        wrong,
+        wrong,
+    ):
         lines.log(health, withhold=True)
     levels, texts = zip(*lines, strict=True)
     assert levels == ('warn', 'error')
@@ -103,13 +124,16 @@ def test_health_is_logged_once_a_quantity_and_when_it_is_ok_again(clock):
     assert lines[5][1].endswith('(1 more since the last such line)')
 
 
-@pytest.mark.parametrize(('image', 'published', 'fix'), [
-    ('/camera/image', ['/camera/image/compressed', '/b'], 'image_transport:=compressed'),
-    ('/camera/image', ['/b', '/a'], '/a, /b; remap image'),
-    ('/camera/image', [], 'no topic with images has a publisher'),
-    ('/camera/image', ['/camera/image'], 'quality of service'),
-    ('/image/compressed', ['/image'], 'image_transport:=raw'),
-])
+@pytest.mark.parametrize(
+    ('image', 'published', 'fix'),
+    [
+        ('/camera/image', ['/camera/image/compressed', '/b'], 'image_transport:=compressed'),
+        ('/camera/image', ['/b', '/a'], '/a, /b; remap image'),
+        ('/camera/image', [], 'no topic with images has a publisher'),
+        ('/camera/image', ['/camera/image'], 'quality of service'),
+        ('/image/compressed', ['/image'], 'image_transport:=raw'),
+    ],
+)
 def test_why_no_image_comes(image, published, fix):
     assert fix in diagnostics.why_no_image(image, published).text
 
@@ -131,7 +155,7 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
     def silence(images: int, **refused: int) -> Silence:
         return report(statistics, images, counts(**refused)).silence
 
-    clock.now = 60 * SECOND   # kernels were compiled
+    clock.now = 60 * SECOND  # kernels were compiled
     statistics.start()
     clock.now = 63 * SECOND
     assert silence(90, no_imu=10) == Silence(3.0, 90, {Refusal.NO_IMU: 10})
@@ -142,29 +166,45 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
     clock.now = 64 * SECOND
     assert silence(90, no_imu=10).seconds == 0.0
     clock.now = 66 * SECOND
-    assert silence(150, no_imu=12) == Silence(2.0, 60, {Refusal.NO_IMU: 2},
-                                              'LOW_PARALLAX: at rest')
+    assert silence(150, no_imu=12) == Silence(
+        2.0, 60, {Refusal.NO_IMU: 2}, 'LOW_PARALLAX: at rest'
+    )
 
 
-@pytest.mark.parametrize(('share', 'size', 'jitter', 'expected'), [
-    (0.5, 921_600, 0, 'config/fastdds.xml'), (0.95, 921_600, 0, ''), (0.5, 300_000, 0, ''),
-    # Of a rhythm with jitter; of a slow start, before the last seconds.
-    (0.5, 921_600, 2_000_000, 'config/fastdds.xml'), (1.0, 921_600, 200_000, ''),
-    (1.0, 921_600, 2_000_000, 'jitter by 1.9'), (0.9, 300_000, 2_000_000, 'jitter by ')])
+@pytest.mark.parametrize(
+    ('share', 'size', 'jitter', 'expected'),
+    [
+        (0.5, 921_600, 0, 'config/fastdds.xml'),
+        (0.95, 921_600, 0, ''),
+        (0.5, 300_000, 0, ''),
+        # Of a rhythm with jitter; of a slow start, before the last seconds.
+        (0.5, 921_600, 2_000_000, 'config/fastdds.xml'),
+        (1.0, 921_600, 200_000, ''),
+        (1.0, 921_600, 2_000_000, 'jitter by 1.9'),
+        (0.9, 300_000, 2_000_000, 'jitter by '),
+    ],
+)
 def test_lost_images_and_jitter_are_reported(share, size, jitter, expected):
     rng = np.random.default_rng(0)
-    stamps = [k * SECOND // 30 + int(jitter * rng.normal()) for k in range(300)
-              if k < 100 or rng.random() < share]
+    stamps = [
+        k * SECOND // 30 + int(jitter * rng.normal())
+        for k in range(300)
+        if k < 100 or rng.random() < share
+    ]
     text = diagnostics.stamps_warning(stamps, size)
     assert expected in text
     assert bool(text) == bool(expected)
 
 
-@pytest.mark.parametrize('change', [
-    lambda k: 0 if k % 6 == 0 else k * SECOND // 30,              # no stamp
-    lambda k: (k % 100) * SECOND // 30,                           # a bag that is looped
-    lambda k: k * SECOND // 30 + k // 12 * 15_000_000,            # a driver that pauses
-    lambda k: k * SECOND // 30 + k // 40 % 2 * (k % 40) * 4_000_000])   # exposure that changes
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda k: 0 if k % 6 == 0 else k * SECOND // 30,  # no stamp
+        lambda k: (k % 100) * SECOND // 30,  # a bag that is looped
+        lambda k: k * SECOND // 30 + k // 12 * 15_000_000,  # a driver that pauses
+        lambda k: k * SECOND // 30 + k // 40 % 2 * (k % 40) * 4_000_000,
+    ],
+)  # exposure that changes
 def test_other_changes_of_stamps_are_no_jitter(change):
     assert not diagnostics.stamps_warning([change(k) for k in range(300)], 300_000)
 
@@ -174,24 +214,45 @@ def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
     inliers = np.arange(count) < 15
     zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
     return PairResult(
-        reference_stamp_ns=0, stamp_ns=1, reference_ns1=0, reference_ns2=1, frame_id='',
+        reference_stamp_ns=0,
+        stamp_ns=1,
+        reference_ns1=0,
+        reference_ns2=1,
+        frame_id='',
         interval=0.1,
         pose=RelativePose(status=status, reason=reason, inliers=inliers, model='uniform'),
         matches=Matches(np.arange(count, dtype=np.uint32), zeros2, zeros2, np.ones(count)),
-        row_times1=np.zeros(count), row_times2=np.zeros(count), rays1=zeros3, rays2=zeros3,
-        parallax=3.25)
+        row_times1=np.zeros(count),
+        row_times2=np.zeros(count),
+        rays1=zeros3,
+        rays2=zeros3,
+        parallax=3.25,
+    )
 
 
 def counts(frames: int = 0, taken: int = 0, **refused: int) -> SequencerCounts:
-    return SequencerCounts(frames=frames, frames_taken=taken,
-                           refused={Refusal(name): n for name, n in refused.items()},
-                           imu_samples=0, imu_gaps=0, clock_jumps=0)
+    return SequencerCounts(
+        frames=frames,
+        frames_taken=taken,
+        refused={Refusal(name): n for name, n in refused.items()},
+        imu_samples=0,
+        imu_gaps=0,
+        clock_jumps=0,
+    )
 
 
-def report(statistics: Statistics, images: int = 0, counted: SequencerCounts | None = None, *,
-           problem: str = '', missing: tuple[str, ...] = (), **inputs: int) -> diagnostics.Report:
-    return statistics.report(Counter(image=images, **inputs), counted or counts(),
-                             problem=problem, missing=missing)
+def report(
+    statistics: Statistics,
+    images: int = 0,
+    counted: SequencerCounts | None = None,
+    *,
+    problem: str = '',
+    missing: tuple[str, ...] = (),
+    **inputs: int,
+) -> diagnostics.Report:
+    return statistics.report(
+        Counter(image=images, **inputs), counted or counts(), problem=problem, missing=missing
+    )
 
 
 def values(statistics: Statistics, **options: Any) -> dict[str, str]:
@@ -203,10 +264,17 @@ def test_rates_and_load_are_those_since_the_last_report(clock, statistics):
         clock.now = (k + 1) * SECOND // 30
         statistics.add_frame(clock.now - 20 * 10**6)
     clock.now = SECOND
-    names = ('image_rate_hz', 'imu_rate_hz', 'worker_busy_percent', 'frame_time_p50_ms',
-             'frame_time_p99_ms')
-    for images, expected in ((60, ('60.0', '400.0', '60', '20.0', '20.0')),
-                             (75, ('15.0', '0.0', '0', '20.0', '20.0'))):
+    names = (
+        'image_rate_hz',
+        'imu_rate_hz',
+        'worker_busy_percent',
+        'frame_time_p50_ms',
+        'frame_time_p99_ms',
+    )
+    for images, expected in (
+        (60, ('60.0', '400.0', '60', '20.0', '20.0')),
+        (75, ('15.0', '0.0', '0', '20.0', '20.0')),
+    ):
         found = values(statistics, images=images, imu=400)
         assert tuple(found[name] for name in names) == expected
         clock.now += SECOND
@@ -224,8 +292,10 @@ def test_latency_is_from_ready_to_publication(clock, statistics):
 
 def test_refused_frames_are_reported_once(statistics):
     later = counts(frames=11, taken=5, overload=3, no_imu=3)
-    for counted, parts in ((counts(9, 4, overload=3, no_imu=2), ('5 frames', '3 overload, 2 no_')),
-                           (later, ('1 frames', '(1 no_imu)'))):
+    for counted, parts in (
+        (counts(9, 4, overload=3, no_imu=2), ('5 frames', '3 overload, 2 no_')),
+        (later, ('1 frames', '(1 no_imu)')),
+    ):
         found = report(statistics, counted=counted)
         assert found.level == WARN
         assert all(part in found.text for part in parts)
@@ -240,24 +310,50 @@ def test_refused_frames_are_reported_once(statistics):
 
 # Besides the refusals.
 EXPECTED = {
-    'state': 'degraded', 'missing': 'imu', 'image_rate_hz': '30.0', 'camera_info_rate_hz': '31.0',
-    'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
-    'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
-    'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
+    'state': 'degraded',
+    'missing': 'imu',
+    'image_rate_hz': '30.0',
+    'camera_info_rate_hz': '31.0',
+    'imu_rate_hz': '200.0',
+    'accel_rate_hz': '100.0',
+    'frames_received': '2000',
+    'frames_processed': '1064',
+    'frames_failed': '3',
+    'messages_invalid': '15',
+    'imu_samples': '9000',
+    'imu_gaps': '11',
+    'imu_repeated': '13',
+    'imu_late': '14',
     'imu_wild': '16',
-    'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
-    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
+    'clock_jumps': '12',
+    'pairs': '3',
+    'poses': '2',
+    'matches': '20',
+    'inliers': '15',
+    'inlier_ratio': '0.750',
+    'parallax_px': '3.2',
+    'residual_rms_px': '',
     'pixel_sigma_px': '',
-    'interval_s': '0.100', 'rotation_difference_to_gyro_deg': '', 'model': 'uniform',
+    'interval_s': '0.100',
+    'rotation_difference_to_gyro_deg': '',
+    'model': 'uniform',
     'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
-    'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
-    'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
-    'tracked_readout_time_ms': '31.00', 'tracked_readout_time_sigma_ms': '0.70',
+    'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300',
+    'tracked_time_offset_ms': '4.00',
+    'tracked_time_offset_sigma_ms': '0.50',
+    'applied_time_offset_ms': '-1.50',
+    'tracked_readout_time_ms': '31.00',
+    'tracked_readout_time_sigma_ms': '0.70',
     'applied_readout_time_ms': '0.80',
-    'health': 'ok', 'health_findings': 'time_offset ok: 4 ms',
-    'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
-    'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
-    'last_reason_no_pose': 'LOW_PARALLAX: at rest'}
+    'health': 'ok',
+    'health_findings': 'time_offset ok: 4 ms',
+    'latency_p50_ms': '15.0',
+    'latency_p99_ms': '15.0',
+    'frame_time_p50_ms': '30.0',
+    'frame_time_p99_ms': '30.0',
+    'worker_busy_percent': '2',
+    'last_reason_no_pose': 'LOW_PARALLAX: at rest',
+}
 
 
 def test_every_counter_has_its_own_field(clock, statistics):
@@ -267,29 +363,49 @@ def test_every_counter_has_its_own_field(clock, statistics):
         statistics.add_failure('a frame failed')
     offset = Finding('time_offset', FindingState.OK, '4 ms', '', 0.0, 0.004, 0.0005, 's', True)
     last = replace(
-        pair(Status.LOW_PARALLAX, 'at rest'), health=Assessment((offset,)), tracked=Tracked(
-            gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
-            time_offset=0.004, time_offset_sigma=0.0005, readout_time=0.031,
-            readout_time_sigma=0.0007, pairs=7), applied=Applied(-0.0015, 0.0008))
+        pair(Status.LOW_PARALLAX, 'at rest'),
+        health=Assessment((offset,)),
+        tracked=Tracked(
+            gyro_bias=np.array([0.01, -0.02, 0.03]),
+            gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
+            time_offset=0.004,
+            time_offset_sigma=0.0005,
+            readout_time=0.031,
+            readout_time_sigma=0.0007,
+            pairs=7,
+        ),
+        applied=Applied(-0.0015, 0.0008),
+    )
     clock.now = SECOND
     for result in (pair(), pair(), last):
         statistics.add_pair(result, clock.now - 15 * 10**6)
     statistics.add_frame(clock.now - 30 * 10**6)
-    counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,
-                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14,
-                              imu_wild=16)
+    counted = SequencerCounts(
+        frames=2000,
+        frames_taken=1064,
+        refused=refused,
+        imu_samples=9000,
+        imu_gaps=11,
+        clock_jumps=12,
+        imu_repeated=13,
+        imu_late=14,
+        imu_wild=16,
+    )
     clock.now = 2 * SECOND
-    found = report(statistics, 60, counted, missing=('imu',), camera_info=62, imu=400, accel=200,
-                   invalid=15).values
+    found = report(
+        statistics, 60, counted, missing=('imu',), camera_info=62, imu=400, accel=200, invalid=15
+    ).values
     expected = EXPECTED | {
-        f'frames_refused_{reason.value}': str(n) for reason, n in refused.items()}
+        f'frames_refused_{reason.value}': str(n) for reason, n in refused.items()
+    }
     assert (dict(found), len(found)) == (expected, len(expected))
 
 
 def test_every_field_is_documented(statistics):
     text = (ROOT / 'docs' / 'operation.md').read_text(encoding='utf-8')
-    documented = set(re.findall(r'`(\w+)`', text[text.index('## Diagnostics'):]
-                                .partition('\n## ')[0]))
+    documented = set(
+        re.findall(r'`(\w+)`', text[text.index('## Diagnostics') :].partition('\n## ')[0])
+    )
     refusals = {f'frames_refused_{reason.value}' for reason in Refusal}
     assert values(statistics).keys() - refusals <= documented
     assert {reason.value for reason in Refusal} <= documented
@@ -300,7 +416,10 @@ def test_level_and_text(statistics):
     assert (found.level, found.text) == (ERROR, 'why')
     fields = dict(found.values)
     assert (fields['state'], fields['missing'], fields['tracked_time_offset_ms']) == (
-        'not estimating', 'a, b', '')
+        'not estimating',
+        'a, b',
+        '',
+    )
     assert report(statistics).level == OK
     statistics.add_pair(pair(Status.LOW_PARALLAX, 'at rest'), 0)
     found = report(statistics)
@@ -314,16 +433,23 @@ def test_a_start_is_no_error_and_lost_images_are_a_warning(statistics):
     starting = statistics.report(Counter(), None, problem=diagnostics.STARTING, missing=())
     assert (starting.level, dict(starting.values)['state']) == (OK, 'not estimating')
     statistics.add_pair(pair(), 0)
-    lost = statistics.report(Counter(image=9), counts(9, 9), problem='', missing=(),
-                             warning='lost')
+    lost = statistics.report(
+        Counter(image=9), counts(9, 9), problem='', missing=(), warning='lost'
+    )
     assert (lost.level, lost.text, dict(lost.values)['state']) == (WARN, 'lost', 'degraded')
     worse = statistics.report(Counter(), None, problem='no image', missing=(), warning='lost')
     assert worse.text == 'no image'
 
 
-@pytest.mark.parametrize(('state', 'level', 'shown'), [
-    (FindingState.OK, OK, 'ok'), (FindingState.UNKNOWN, OK, 'ok'),
-    (FindingState.SUSPECT, WARN, 'degraded'), (FindingState.WRONG, ERROR, 'told wrong')])
+@pytest.mark.parametrize(
+    ('state', 'level', 'shown'),
+    [
+        (FindingState.OK, OK, 'ok'),
+        (FindingState.UNKNOWN, OK, 'ok'),
+        (FindingState.SUSPECT, WARN, 'degraded'),
+        (FindingState.WRONG, ERROR, 'told wrong'),
+    ],
+)
 def test_level_and_text_of_the_health(statistics, state, level, shown):
     fault = finding(state, 0.2)
     statistics.add_pair(replace(pair(), health=Assessment((fault,))), 0)
@@ -341,8 +467,11 @@ def test_level_and_text_of_the_health(statistics, state, level, shown):
 DECLARATIONS = {name: declared for name, _, declared in Parameters.declarations()}
 DEFAULTS = {name: default for name, default, _ in Parameters.declarations()}
 # Distortion needs a camera matrix.
-LIVE = [name for name, declared in DECLARATIONS.items()
-        if declared.live and name != 'distortion_coefficients']
+LIVE = [
+    name
+    for name, declared in DECLARATIONS.items()
+    if declared.live and name != 'distortion_coefficients'
+]
 
 
 @pytest.fixture(scope='module')
@@ -395,8 +524,11 @@ def illegal_values(declared: Declared) -> Iterator[Any]:
         yield 'none of them'
     if declared.kind is float:
         yield float('nan')
-        yield from (bound + step for bound, step in ((declared.low, -1.0), (declared.high, 1.0))
-                    if abs(bound) < 1e12)
+        yield from (
+            bound + step
+            for bound, step in ((declared.low, -1.0), (declared.high, 1.0))
+            if abs(bound) < 1e12
+        )
     if declared.kind is int:
         yield int(declared.low) - 1
         yield int(declared.high) + 1
@@ -407,12 +539,16 @@ def other_value(name: str, declared: Declared) -> Any:
     if declared.kind is bool:
         return not DEFAULTS[name]
     if declared.kind is str:
-        return declared.choices[-1] if declared.choices[-1] != DEFAULTS[name] else (
-            declared.choices[0])
+        return (
+            declared.choices[-1]
+            if declared.choices[-1] != DEFAULTS[name]
+            else (declared.choices[0])
+        )
     if declared.kind is tuple:
-        return {'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0),
-                'camera_matrix': (5.0, 0.0, 2.0, 0.0, 5.0, 2.0, 0.0, 0.0, 1.0),
-                }.get(name, (0.1,) * (declared.length or 4))
+        return {
+            'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0),
+            'camera_matrix': (5.0, 0.0, 2.0, 0.0, 5.0, 2.0, 0.0, 0.0, 1.0),
+        }.get(name, (0.1,) * (declared.length or 4))
     assert declared.kind in (float, int), name
     return declared.kind(0.3 * declared.low + 0.7 * declared.high)
 
@@ -435,8 +571,9 @@ def test_an_illegal_value_is_refused_with_its_reason(node, parameters, name):
     assert (parameters.current, len(CHANGES)) == (Parameters(), before)
 
 
-@pytest.mark.parametrize('name', [
-    name for name, declared in DECLARATIONS.items() if not declared.live])
+@pytest.mark.parametrize(
+    'name', [name for name, declared in DECLARATIONS.items() if not declared.live]
+)
 def test_the_parameters_of_the_construction_are_read_only(node, parameters, name):
     value = DEFAULTS[name]
     value = list(value) if isinstance(value, tuple) else value
@@ -447,8 +584,9 @@ def test_the_parameters_of_the_construction_are_read_only(node, parameters, name
 def test_a_live_parameter_is_passed_on(node, parameters, name):
     value, before = other_value(name, DECLARATIONS[name]), len(CHANGES)
     assert value != DEFAULTS[name]
-    [result] = node.set_parameters([Parameter(
-        name, value=list(value) if isinstance(value, tuple) else value)])
+    [result] = node.set_parameters(
+        [Parameter(name, value=list(value) if isinstance(value, tuple) else value)]
+    )
     assert result.successful, result.reason
     assert len(CHANGES) == before + 1
     assert CHANGES[-1] is parameters.current

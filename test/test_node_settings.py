@@ -59,38 +59,64 @@ class Running:
     def wait_for_status(self, expected: str) -> dict[str, str]:
         """Values of the first report from now on with this error."""
         count = len(self.diagnostics)
-        report = wait_until(lambda: next(
-            (item for item in self.diagnostics[count:] if expected in item.status[0].message),
-            None), expected, self.node, timeout=30.0)
+        report = wait_until(
+            lambda: next(
+                (item for item in self.diagnostics[count:] if expected in item.status[0].message),
+                None,
+            ),
+            expected,
+            self.node,
+            timeout=30.0,
+        )
         assert report.status[0].level == ERROR
         return diagnostic_values(report)
 
 
 @pytest.fixture(scope='module')
 def running(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Running]:
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS,
-            parameters={'image_transport': 'raw', UNKNOWN_OVERRIDE: 3,
-                        'qos_overrides./imu/data_raw.subscription.durability': 'volatile',
-                        **faults.reliable(*RELIABLE)}) as node:
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS,
+            remap=BAG_TOPICS,
+            parameters={
+                'image_transport': 'raw',
+                UNKNOWN_OVERRIDE: 3,
+                'qos_overrides./imu/data_raw.subscription.durability': 'volatile',
+                **faults.reliable(*RELIABLE),
+            },
+        ) as node,
+    ):
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
-        yield Running(graph, node, faults.drivers(graph, best_effort=[Imu]), diagnostics,
-                      faults.read_messages(bundled_bag, PLAYED))
+        yield Running(
+            graph,
+            node,
+            faults.drivers(graph, best_effort=[Imu]),
+            diagnostics,
+            faults.read_messages(bundled_bag, PLAYED),
+        )
         assert node.signal(signal.SIGTERM)[0] == 0
         assert 'Traceback' not in node.output
 
 
 # -- settings of a running node --------------------------------------------------------------
 
+
 def test_quality_of_service_can_be_overridden_topic_by_topic(running):
     for topic in [*BAG_TOPICS.values(), '/accel']:
         # Of CameraInfo there is another one, for what was latched.
-        [info] = wait_until(lambda topic=topic: [
-            info for info in running.graph.node.get_subscriptions_info_by_topic(topic)
-            if info.qos_profile.durability is DurabilityPolicy.VOLATILE], topic)
+        [info] = wait_until(
+            lambda topic=topic: [
+                info
+                for info in running.graph.node.get_subscriptions_info_by_topic(topic)
+                if info.qos_profile.durability is DurabilityPolicy.VOLATILE
+            ],
+            topic,
+        )
         assert info.qos_profile.reliability is (
-            ReliabilityPolicy.RELIABLE if topic in RELIABLE else ReliabilityPolicy.BEST_EFFORT)
+            ReliabilityPolicy.RELIABLE if topic in RELIABLE else ReliabilityPolicy.BEST_EFFORT
+        )
     assert 'there is no parameter' not in running.node.output
     assert running.node.output.count('is no QoS override of this node') == 1
     assert f'{UNKNOWN_OVERRIDE} is no QoS override of this node' in running.node.output
@@ -106,13 +132,15 @@ def test_missing_inputs_are_reported(running):
     assert int(values['frames_refused_no_calibration']) > 25
     running.publishers[CameraInfo].publish(CameraInfo(width=640, height=480))
     assert running.wait_for_status('uncalibrated')['missing'] == 'calibration'
-    time.sleep(1.0)   # more than two seconds without an IMU, with what is played next
+    time.sleep(1.0)  # more than two seconds without an IMU, with what is played next
     running.play(Image, CameraInfo, later=10.0)
     values = running.wait_for_status('not estimating: no IMU message on /imu/data_raw')
     assert values['poses'] == '0'
     lines = [line for line in running.node.output.splitlines() if line.startswith('[ERROR]')]
-    assert [sum(text in line for line in lines) for text in (
-        'no CameraInfo on', 'uncalibrated', 'no IMU message on')] == [1, 1, 1], lines
+    assert [
+        sum(text in line for line in lines)
+        for text in ('no CameraInfo on', 'uncalibrated', 'no IMU message on')
+    ] == [1, 1, 1], lines
 
 
 def set_parameter(graph: Graph, name: str, value: Any) -> Any:
@@ -141,13 +169,24 @@ def test_a_live_parameter_takes_effect(running):
 NEVER = {'calibrate_at_start': 'never'}
 QUATERNION = {'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
 CANNOT_ESTIMATE = {
-    'no_readout': ({**QUATERNION, **NEVER, 'readout_tme': 0.03}, {},
-                   'not estimating: readout_time must be given', 'readout_time'),
-    'rectified': ({'readout_time': 0, **QUATERNION}, {'image': '/camera/image_rect'},
-                  '/camera/image_rect is a rectified image', ''),
-    'global_shutter': (NEVER, {},
-                       'not publishing: readout_time and quat_cam_imu_xyzw must be given',
-                       'readout_time, quat_cam_imu_xyzw'),
+    'no_readout': (
+        {**QUATERNION, **NEVER, 'readout_tme': 0.03},
+        {},
+        'not estimating: readout_time must be given',
+        'readout_time',
+    ),
+    'rectified': (
+        {'readout_time': 0, **QUATERNION},
+        {'image': '/camera/image_rect'},
+        '/camera/image_rect is a rectified image',
+        '',
+    ),
+    'global_shutter': (
+        NEVER,
+        {},
+        'not publishing: readout_time and quat_cam_imu_xyzw must be given',
+        'readout_time, quat_cam_imu_xyzw',
+    ),
 }
 
 
@@ -156,15 +195,25 @@ def test_missing_parameters_are_reported_and_the_node_stays(ros_domain_id):
     with ExitStack() as stack:
         graph = stack.enter_context(Graph())
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        nodes = {name: stack.enter_context(node_process(
-            parameters=parameters, remap={**remap, '__node': name},
-            node='global_shutter_node' if name == 'global_shutter' else 'relpose_node'))
-            for name, (parameters, remap, _, _) in CANNOT_ESTIMATE.items()}
+        nodes = {
+            name: stack.enter_context(
+                node_process(
+                    parameters=parameters,
+                    remap={**remap, '__node': name},
+                    node='global_shutter_node' if name == 'global_shutter' else 'relpose_node',
+                )
+            )
+            for name, (parameters, remap, _, _) in CANNOT_ESTIMATE.items()
+        }
         for name, node in nodes.items():
             _, _, expected, missing = CANNOT_ESTIMATE[name]
-            report = wait_until(lambda name=name: next(
-                (item for item in diagnostics if f'/{name}:' in item.status[0].name), None),
-                'diagnostics', node)
+            report = wait_until(
+                lambda name=name: next(
+                    (item for item in diagnostics if f'/{name}:' in item.status[0].name), None
+                ),
+                'diagnostics',
+                node,
+            )
             assert report.status[0].level == ERROR
             assert expected in report.status[0].message
             assert diagnostic_values(report)['missing'] == missing
@@ -174,8 +223,9 @@ def test_missing_parameters_are_reported_and_the_node_stays(ros_domain_id):
             assert node.signal(signal.SIGTERM)[0] == 0
             assert node.output.count(expected) == 1
             assert 'Traceback' not in node.output
-            assert ("there is no parameter 'readout_tme'; did you mean readout_time"
-                    in node.output) == (name == 'no_readout')
+            assert (
+                "there is no parameter 'readout_tme'; did you mean readout_time" in node.output
+            ) == (name == 'no_readout')
 
 
 ESTIMATES = {'readout_time': 0.03, **QUATERNION}
@@ -221,18 +271,27 @@ class TransformBroadcaster:
 
 
 def test_a_camera_without_camera_info_gives_poses_and_transforms(
-        ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    ros_domain_id, bundled_bag, tmp_path, monkeypatch
+):
     """Its calibration is in the parameters."""
     (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv(
+        'PYTHONPATH',
+        os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]),
+    )
     messages = faults.read_messages(bundled_bag, 1.5)
     info = next(message for _, message in messages if isinstance(message, CameraInfo))
-    parameters = {'camera_matrix': info.k.tolist(), 'distortion_model': info.distortion_model,
-                  'distortion_coefficients': list(info.d), 'image_transport': 'raw',
-                  'publish_tf': True}
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node:
+    parameters = {
+        'camera_matrix': info.k.tolist(),
+        'distortion_model': info.distortion_model,
+        'distortion_coefficients': list(info.d),
+        'image_transport': 'raw',
+        'publish_tf': True,
+    }
+    with (
+        Graph() as graph,
+        node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node,
+    ):
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         transforms = graph.listen(TransformStamped, '/sent_transform')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
@@ -251,17 +310,21 @@ def test_a_camera_without_camera_info_gives_poses_and_transforms(
     for message, sent in zip(poses, transforms, strict=False):
         assert sent.header.stamp == message.header.stamp
         assert (sent.header.frame_id, sent.child_frame_id) == (
-            'camera_optical_frame', 'camera_optical_frame_reference')
+            'camera_optical_frame',
+            'camera_optical_frame_reference',
+        )
         t, q = message.pose.pose.position, message.pose.pose.orientation
         found, r = sent.transform.translation, sent.transform.rotation
         inverse = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
         np.testing.assert_allclose([found.x, found.y, found.z], -inverse.apply([t.x, t.y, t.z]))
         np.testing.assert_allclose(
-            Rotation.from_quat([r.x, r.y, r.z, r.w]).as_matrix(), inverse.as_matrix(), atol=1e-12)
+            Rotation.from_quat([r.x, r.y, r.z, r.w]).as_matrix(), inverse.as_matrix(), atol=1e-12
+        )
 
 
 def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
-        ros_domain_id, bundled_bag):
+    ros_domain_id, bundled_bag
+):
     messages = faults.read_messages(bundled_bag, 1.5)
     info = next(message for _, message in messages if isinstance(message, CameraInfo))
     with Graph() as graph:
@@ -270,8 +333,11 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
         graph.node.create_publisher(CompressedImage, BAG_TOPICS['image'] + '/compressed', 1)
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        with node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={
-                'image_transport': 'raw', 'use_sim_time': True}) as node:
+        with node_process(
+            BUNDLED_PARAMETERS,
+            remap=BAG_TOPICS,
+            parameters={'image_transport': 'raw', 'use_sim_time': True},
+        ) as node:
             node.wait_for('set image_transport:=compressed')
             clock, stands = graph.publisher(Clock, '/clock'), Clock(clock=Time(sec=100))
             clock.publish(stands)
@@ -282,15 +348,20 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
             assert node.output.count(f'no image on {BAG_TOPICS["image"]} for 5 s; ') == 1
             assert 'incompatible' not in node.output
             # Stamped by the clock of the graph, at steady times.
-            wait_until(lambda: clock.publish(stands) or stamp_of(
-                diagnostics[-1]) == 100 * faults.SECOND, 'time', node)   # best effort
+            wait_until(
+                lambda: clock.publish(stands) or stamp_of(diagnostics[-1]) == 100 * faults.SECOND,
+                'time',
+                node,
+            )  # best effort
 
 
 def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bundled_bag):
     """A time offset that is 30 ms off: detected by the fourth pair or the fifth."""
     parameters = {'time_offset': 0.03, 'image_transport': 'raw'}
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node:
+    with (
+        Graph() as graph,
+        node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node,
+    ):
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         pairs = graph.listen(DiagnosticArray, '/relpose_node/pairs')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
@@ -298,65 +369,102 @@ def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bun
         for topic in ('relative_pose', 'pairs'):
             graph.wait_for_publisher(f'/relpose_node/{topic}')
         faults.play(faults.drivers(graph), faults.read_messages(bundled_bag, 2.5))
-        report = wait_until(lambda: next((item for item in diagnostics if diagnostic_values(
-            item)['health'] == 'wrong'), None), 'health: wrong', node)
-        wait_until(lambda: sum(diagnostic_values(message)['health'] == 'wrong'
-                               for message in pairs) >= 2, 'two pairs of that', node)
+        report = wait_until(
+            lambda: next(
+                (item for item in diagnostics if diagnostic_values(item)['health'] == 'wrong'),
+                None,
+            ),
+            'health: wrong',
+            node,
+        )
+        wait_until(
+            lambda: sum(diagnostic_values(message)['health'] == 'wrong' for message in pairs) >= 2,
+            'two pairs of that',
+            node,
+        )
         assert node.signal(signal.SIGTERM)[0] == 0
         [line] = [line for line in node.output.splitlines() if 'ERROR' in line]
     values, text = diagnostic_values(report), 'time_offset is wrong: '
     assert report.status[0].level == ERROR
     assert report.status[0].message.startswith(text)
     assert (values['state'], values['last_reason_no_pose'].split(':')[0]) == (
-        'told wrong', 'WITHHELD')
+        'told wrong',
+        'WITHHELD',
+    )
     assert 'time_offset wrong: ' in values['health_findings']
-    assert all(part in line for part in (
-        text, 'active 30.0', 'set time_offset: ', 'withhold_when_wrong: false'))
-    wrong = {stamp_of(message): value for message in pairs
-             if (value := diagnostic_values(message))['health'] == 'wrong'}
+    assert all(
+        part in line
+        for part in (text, 'active 30.0', 'set time_offset: ', 'withhold_when_wrong: false')
+    )
+    wrong = {
+        stamp_of(message): value
+        for message in pairs
+        if (value := diagnostic_values(message))['health'] == 'wrong'
+    }
     assert wrong.keys().isdisjoint(map(stamp_of, poses))
-    assert all(value['status'] == 'WITHHELD' and value['reason'].startswith(text)
-               for value in wrong.values())
+    assert all(
+        value['status'] == 'WITHHELD' and value['reason'].startswith(text)
+        for value in wrong.values()
+    )
 
 
-@pytest.mark.parametrize(('parameters', 'expected'), [
-    ({'readout_time': 3.0}, 'readout_time'),
-    ({'readout_time': 'fast'}, 'readout_time must be of type float'),
-    ({'solver': '7pt'}, 'solver must be one of auto, uniform_9pt'),
-    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 2.0]'}, 'quat_cam_imu_xyzw'),
-    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 1.0]'}, 'quat_cam_imu_xyzw must be 4 values'),
-    ({**ESTIMATES, 'stamps_file': '/nowhere/stamps.txt'},
-     'stamps_file /nowhere/stamps.txt cannot be written'),
-    pytest.param(
-        {'publish_tf': True}, 'publish_tf needs tf2_ros, which is not installed',
-        marks=pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is not None,
-                                 reason='tf2_ros is installed')),
-    ({**ESTIMATES, f'{OVERRIDE}.reliability': 'sometimes'},
-     'a QoS override is not legal: Unexpected QoS override for policy `reliability`: `sometimes`'),
-    ({**ESTIMATES, f'{OVERRIDE}.depth': 'many'}, f'{OVERRIDE}.depth'),
-])
+@pytest.mark.parametrize(
+    ('parameters', 'expected'),
+    [
+        ({'readout_time': 3.0}, 'readout_time'),
+        ({'readout_time': 'fast'}, 'readout_time must be of type float'),
+        ({'solver': '7pt'}, 'solver must be one of auto, uniform_9pt'),
+        ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 2.0]'}, 'quat_cam_imu_xyzw'),
+        ({'quat_cam_imu_xyzw': '[0.0, 0.0, 1.0]'}, 'quat_cam_imu_xyzw must be 4 values'),
+        (
+            {**ESTIMATES, 'stamps_file': '/nowhere/stamps.txt'},
+            'stamps_file /nowhere/stamps.txt cannot be written',
+        ),
+        pytest.param(
+            {'publish_tf': True},
+            'publish_tf needs tf2_ros, which is not installed',
+            marks=pytest.mark.skipif(
+                importlib.util.find_spec('tf2_ros') is not None, reason='tf2_ros is installed'
+            ),
+        ),
+        (
+            {**ESTIMATES, f'{OVERRIDE}.reliability': 'sometimes'},
+            (
+                'a QoS override is not legal: Unexpected QoS override for policy '
+                '`reliability`: `sometimes`'
+            ),
+        ),
+        ({**ESTIMATES, f'{OVERRIDE}.depth': 'many'}, f'{OVERRIDE}.depth'),
+    ],
+)
 def test_an_illegal_parameter_ends_the_node_with_one_line(
-        ros_domain_id, parameters, expected, capfd, monkeypatch):
+    ros_domain_id, parameters, expected, capfd, monkeypatch
+):
     """In this process, as a node of its own takes seconds to start."""
     # It would end this process.
-    monkeypatch.setattr('rs_relpose_ros.nodes.sensor_node.leave',
-                        lambda code: pytest.fail(f'left with {code}'))
+    monkeypatch.setattr(
+        'rs_relpose_ros.nodes.sensor_node.leave', lambda code: pytest.fail(f'left with {code}')
+    )
     words = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     assert node_module.main(['--ros-args', *words]) == 2
     said = capfd.readouterr().err
     # Of /rosout, where this process had nodes of the same name before, rcl complains.
-    lines = [line for line in said.splitlines()
-             if '[relpose_node]: ' in line and '[INFO]' not in line]
+    lines = [
+        line for line in said.splitlines() if '[relpose_node]: ' in line and '[INFO]' not in line
+    ]
     assert 'Traceback' not in said
     assert len(lines) == 1, lines
     assert '[FATAL]' in lines[0]
     assert expected in lines[0]
 
 
-@pytest.mark.parametrize('content, expected', [
-    (None, 'Error opening YAML file'),
-    ('a: [1\nb: 2', 'Sequences can only be values'),
-])
+@pytest.mark.parametrize(
+    'content, expected',
+    [
+        (None, 'Error opening YAML file'),
+        ('a: [1\nb: 2', 'Sequences can only be values'),
+    ],
+)
 def test_a_parameter_file_that_cannot_be_read_is_one_line(tmp_path, content, expected, capfd):
     file = tmp_path / 'camera.yaml'
     if content is not None:

@@ -32,23 +32,29 @@ from rs_relpose_ros.offline.truth import TrueTrajectory
 
 START_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
-INTERVAL = 0.15   # [s] from keyframe to keyframe
-ROW = 0.015   # [s] from the stamped to the middle row
-SIGMA_R, SIGMA_T = 2e-4, 8e-3   # [rad]
+INTERVAL = 0.15  # [s] from keyframe to keyframe
+ROW = 0.015  # [s] from the stamped to the middle row
+SIGMA_R, SIGMA_T = 2e-4, 8e-3  # [rad]
 QUAT = (0.502457, -0.504378, 0.507698, 0.485163)
 LEVER = (0.03, 0.01, -0.02)
 GYRO_BIAS, ACCEL_BIAS = (0.011, -0.007, 0.005), (0.06, -0.04, 0.05)
-PARAMETERS = Parameters.from_mapping({
-    'quat_cam_imu_xyzw': QUAT, 'imu_position': LEVER, 'readout_time': 0.03, 'max_coast': 2.0,
-    'smoothing_lag': 2.0,   # faster than with the default
-    'gyro_bias': tuple(b + 3e-4 for b in GYRO_BIAS)})
+PARAMETERS = Parameters.from_mapping(
+    {
+        'quat_cam_imu_xyzw': QUAT,
+        'imu_position': LEVER,
+        'readout_time': 0.03,
+        'max_coast': 2.0,
+        'smoothing_lag': 2.0,  # faster than with the default
+        'gyro_bias': tuple(b + 3e-4 for b in GYRO_BIAS),
+    }
+)
 
 
 @dataclass(frozen=True)
 class Walk:
     pairs: list[KeyframePair]
     samples: list[ImuSample]
-    stamps: np.ndarray   # [ns] of the truth, with positions and quaternions
+    stamps: np.ndarray  # [ns] of the truth, with positions and quaternions
     positions: np.ndarray
     quats: np.ndarray
 
@@ -63,17 +69,25 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
     at = np.arange(-0.5, seconds + 0.4, 1.0 / imu_rate)
     states = path.states(at)
     R_cam_imu = Rotation.from_quat(QUAT).as_matrix()
-    gyro, accel = ImuModel(R_cam_imu, LEVER, GYRO_BIAS, ACCEL_BIAS, 1.7e-4 * math.sqrt(imu_rate),
-                           2e-3 * math.sqrt(imu_rate)).measure(states, rng)
+    gyro, accel = ImuModel(
+        R_cam_imu,
+        LEVER,
+        GYRO_BIAS,
+        ACCEL_BIAS,
+        1.7e-4 * math.sqrt(imu_rate),
+        2e-3 * math.sqrt(imu_rate),
+    ).measure(states, rng)
     stamps = START_NS + np.rint(at * 1e9).astype(np.int64)
-    samples = [ImuSample(int(ns), tuple(w), tuple(f))
-               for ns, w, f in zip(stamps, gyro, accel, strict=True)]
+    samples = [
+        ImuSample(int(ns), tuple(w), tuple(f))
+        for ns, w, f in zip(stamps, gyro, accel, strict=True)
+    ]
     times = np.arange(0.0, seconds, INTERVAL)
     middle = path.states(times + ROW)
     noise = np.diag([SIGMA_R**2] * 3 + [SIGMA_T**2] * 2)
     pairs = []
     for k in range(len(times) - 1):
-        R1, R2 = middle.R_world_cam[k:k + 2]
+        R1, R2 = middle.R_world_cam[k : k + 2]
         way = R1.T @ (middle.position[k + 1] - middle.position[k])
         error = rng.multivariate_normal(np.zeros(5), noise)
         R = exp_so3(-error[:3]) @ R1.T @ R2
@@ -83,18 +97,37 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
             t = t - tangent_basis(t) @ error[3:]
             information = np.zeros((11, 11))
             information[:5, :5] = np.linalg.inv(noise)
-            images = ImageInformation(ROW, R, t / np.linalg.norm(t), np.tile(t / INTERVAL, 2),
-                                      information, np.zeros(11))
+            images = ImageInformation(
+                ROW, R, t / np.linalg.norm(t), np.tile(t / INTERVAL, 2), information, np.zeros(11)
+            )
         else:
             status, baseline = 'PURE_ROTATION', math.nan
-            images = ImageInformation(ROW, R, np.full(3, np.nan), np.full(6, np.nan),
-                                      np.linalg.inv(noise[:3, :3]), np.zeros(3))
+            images = ImageInformation(
+                ROW,
+                R,
+                np.full(3, np.nan),
+                np.full(6, np.nan),
+                np.linalg.inv(noise[:3, :3]),
+                np.zeros(3),
+            )
         stamp1, stamp2 = (START_NS + round(times[i] * 1e9) for i in (k, k + 1))
-        pairs.append(KeyframePair(
-            stamp2, stamp1, stamp2, 'camera', status, images,
-            baseline * math.exp(0.2 * rng.standard_normal()), 0.2, np.array(GYRO_BIAS), ''))
-    return Walk(pairs, samples, stamps, states.position,
-                Rotation.from_matrix(states.R_world_cam).as_quat())
+        pairs.append(
+            KeyframePair(
+                stamp2,
+                stamp1,
+                stamp2,
+                'camera',
+                status,
+                images,
+                baseline * math.exp(0.2 * rng.standard_normal()),
+                0.2,
+                np.array(GYRO_BIAS),
+                '',
+            )
+        )
+    return Walk(
+        pairs, samples, stamps, states.position, Rotation.from_matrix(states.R_world_cam).as_quat()
+    )
 
 
 @pytest.fixture(scope='module')
@@ -131,8 +164,11 @@ def seconds_of(ns):
 
 def without(pairs, begin, end):
     """Pairs that are not of the time between two times [s]."""
-    return [pair for pair in pairs
-            if seconds_of(pair.current_ns) < begin or seconds_of(pair.reference_ns) > end]
+    return [
+        pair
+        for pair in pairs
+        if seconds_of(pair.current_ns) < begin or seconds_of(pair.reference_ns) > end
+    ]
 
 
 def samples_of(given, begin, end):
@@ -150,14 +186,21 @@ def ate(keyframes, truth):
 
 # --- residuals
 
+
 def test_derivatives_of_deviations_are_those_of_finite_differences():
     rng = np.random.default_rng(0)
     C = Rotation.random(random_state=1).as_matrix()
     arm = np.array([0.1, -0.05, 0.03])
     # R to the world, position, velocity, rate.
-    bodies = [(Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix(),
-               np.array([0.3 * k, 0.0, 0.1]), rng.normal(size=3), rng.normal(size=3))
-              for k in range(2)]
+    bodies = [
+        (
+            Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix(),
+            np.array([0.3 * k, 0.0, 0.1]),
+            rng.normal(size=3),
+            rng.normal(size=3),
+        )
+        for k in range(2)
+    ]
     (R1, c1), (R2, c2) = ((R @ C.T, p + R @ arm) for R, p, _, _ in bodies)
     R, q = np.ascontiguousarray(R1.T @ R2), R1.T @ (c2 - c1)
     t, velocities = q / np.linalg.norm(q), rng.normal(size=6)
@@ -166,8 +209,10 @@ def test_derivatives_of_deviations_are_those_of_finite_differences():
     for (body_R, _, v, w), row in zip(bodies, (5, 8), strict=True):
         moving = v + body_R @ np.cross(w, arm)
         np.testing.assert_allclose(
-            exact[row:row + 3], R1.T @ moving / np.linalg.norm(q) - velocities[row - 5:row - 2],
-            atol=1e-12)
+            exact[row : row + 3],
+            R1.T @ moving / np.linalg.norm(q) - velocities[row - 5 : row - 2],
+            atol=1e-12,
+        )
 
     t = t + 0.05 * rng.normal(size=3)
     t /= np.linalg.norm(t)
@@ -178,13 +223,23 @@ def test_derivatives_of_deviations_are_those_of_finite_differences():
 
     _, by = deviations(*bodies[0], *bodies[1], C, arm, R, t, velocities)
     for k, step in enumerate(1e-6 * np.eye(21)):
-        plus, minus = (deviations(
-            *moved(bodies[0], x[:9]), *moved(bodies[1], x[9:18]), C, arm + x[18:], R, t,
-            velocities)[0] for x in (step, -step))
+        plus, minus = (
+            deviations(
+                *moved(bodies[0], x[:9]),
+                *moved(bodies[1], x[9:18]),
+                C,
+                arm + x[18:],
+                R,
+                t,
+                velocities,
+            )[0]
+            for x in (step, -step)
+        )
         np.testing.assert_allclose(by[:, k], (plus - minus) / 2e-6, atol=1e-6)
 
 
 # --- paths
+
 
 def test_path_is_metric(walked, tracked):
     estimator, out = tracked
@@ -194,7 +249,7 @@ def test_path_is_metric(walked, tracked):
     assert live.ate_m < 0.05
     assert smoothed.ate_m < 0.035
     assert abs(smoothed.scale_error) < 0.01
-    started, = estimator.starts
+    (started,) = estimator.starts
     assert not started.at_rest
     assert started.seconds < 3.0
     assert estimator.counts['contradicting'] == estimator.counts['lost'] == 0
@@ -252,8 +307,9 @@ def test_slow_motion_is_no_known_scale():
     variances = np.diag([1e-6] * 6 + [1e-4, 1e-4, 4e-4] + [1e-4] * 9)
     for speed, expected in ((0.05, 0.2), (0.4, 0.05)):
         zero = np.zeros(3)
-        state = KeyframeState(np.eye(3), zero, np.array([0.0, 0.0, speed]), zero, zero, zero,
-                              variances)
+        state = KeyframeState(
+            np.eye(3), zero, np.array([0.0, 0.0, speed]), zero, zero, zero, variances
+        )
         graph = KeyframeGraph(state, np.eye(3), PARAMETERS.imu, PARAMETERS.odometry)
         assert graph.scale_sigma() == pytest.approx(expected, rel=1e-6)
 
@@ -270,19 +326,30 @@ def test_far_velocities_have_no_information(walked):
 
 def test_a_gross_pair_before_the_start_is_a_wrong_start(walked):
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
-    pairs = [replace(pair, images=replace(pair.images, R=turn @ pair.images.R)) if k == 2 else pair
-             for k, pair in enumerate(walked.pairs[:20])]
+    pairs = [
+        replace(pair, images=replace(pair.images, R=turn @ pair.images.R)) if k == 2 else pair
+        for k, pair in enumerate(walked.pairs[:20])
+    ]
     _, out = run(walked, pairs=pairs)
     assert seconds_of(out[0].imu_ns) > seconds_of(pairs[2].current_ns) + 3.0 * INTERVAL
     assert ate(out, walked.truth) < 0.05
 
 
-@pytest.mark.parametrize('changed, reason', [
-    (lambda force: None, 'there is no accelerometer'),
-    (lambda force: tuple(value / 9.80665 for value in force), 'must be specific force in m/s^2')])
+@pytest.mark.parametrize(
+    'changed, reason',
+    [
+        (lambda force: None, 'there is no accelerometer'),
+        (
+            lambda force: tuple(value / 9.80665 for value in force),
+            'must be specific force in m/s^2',
+        ),
+    ],
+)
 def test_a_faulty_accelerometer_is_the_blocking_reason(walked, changed, reason):
-    samples = [replace(sample, linear_acceleration=changed(sample.linear_acceleration))
-               for sample in samples_of(walked, -1.0, 3.0)]
+    samples = [
+        replace(sample, linear_acceleration=changed(sample.linear_acceleration))
+        for sample in samples_of(walked, -1.0, 3.0)
+    ]
     estimator, out = run(walked, pairs=walked.pairs[:15], samples=samples)
     assert out == []
     assert reason in estimator.blocking_reason
@@ -291,7 +358,7 @@ def test_a_faulty_accelerometer_is_the_blocking_reason(walked, changed, reason):
 def test_without_a_fault_there_is_no_blocking_reason(walked, tracked):
     fresh = OdometryEstimator(PARAMETERS)
     assert fresh.blocking_reason == '' and fresh.warnings() == []
-    fresh.add_imu(replace(walked.samples[0], linear_acceleration=(0.0, 0.0, 20.0)))   # a bump
+    fresh.add_imu(replace(walked.samples[0], linear_acceleration=(0.0, 0.0, 20.0)))  # a bump
     assert fresh.blocking_reason == tracked[0].blocking_reason == ''
 
 
@@ -304,10 +371,16 @@ def test_a_lever_arm_of_zero_is_a_warning():
 def test_order_of_messages_does_not_matter(walked, tracked):
     rng = np.random.default_rng(3)
     # Each message is late by up to 0.08 s.
-    events = sorted([(sample.stamp_ns + rng.uniform(0.0, 0.08) * SECOND, 0, k, sample)
-                     for k, sample in enumerate(walked.samples)]
-                    + [(pair.current_ns + rng.uniform(0.0, 0.08) * SECOND, 1, k, pair)
-                       for k, pair in enumerate(walked.pairs)])
+    events = sorted(
+        [
+            (sample.stamp_ns + rng.uniform(0.0, 0.08) * SECOND, 0, k, sample)
+            for k, sample in enumerate(walked.samples)
+        ]
+        + [
+            (pair.current_ns + rng.uniform(0.0, 0.08) * SECOND, 1, k, pair)
+            for k, pair in enumerate(walked.pairs)
+        ]
+    )
     estimator, out = OdometryEstimator(PARAMETERS), []
     for _, kind, _, message in events:
         (estimator.add_pair if kind else estimator.add_imu)(message)
@@ -319,8 +392,12 @@ def test_order_of_messages_does_not_matter(walked, tracked):
 def test_the_imu_propagates_keyframes(walked):
     half = len(walked.pairs) // 2
     end = seconds_of(walked.pairs[half - 1].current_ns) + 1.5
-    estimator, out = run(walked, pairs=walked.pairs[:half], samples=samples_of(walked, -1.0, end),
-                         estimator=OdometryEstimator(PARAMETERS))
+    estimator, out = run(
+        walked,
+        pairs=walked.pairs[:half],
+        samples=samples_of(walked, -1.0, end),
+        estimator=OdometryEstimator(PARAMETERS),
+    )
     newest = out[-1]
     later = newest.imu_ns + SECOND // 10
     propagated = estimator.propagated(later)
@@ -329,17 +406,25 @@ def test_the_imu_propagates_keyframes(walked):
     np.testing.assert_allclose(newest.R.T @ propagated.R, R, atol=2e-3)
     assert propagated.stamp_ns - newest.stamp_ns == SECOND // 10
     # By the uncertain velocity, whose error is correlated with that of the position.
-    grown = [np.trace(x.pose_covariance[:3, :3]) for x in (
-        newest, estimator.propagated(newest.imu_ns + 13 * SECOND // 10))]
+    grown = [
+        np.trace(x.pose_covariance[:3, :3])
+        for x in (newest, estimator.propagated(newest.imu_ns + 13 * SECOND // 10))
+    ]
     assert grown[1] > grown[0] + 0.5 * 1.3**2 * np.trace(newest.velocity_covariance[:3, :3])
-    assert estimator.propagated(newest.imu_ns + 2 * SECOND) is None   # no samples
+    assert estimator.propagated(newest.imu_ns + 2 * SECOND) is None  # no samples
 
 
 # --- the frame of the robot
 
 # Camera optical axes on a robot with x forward and z up, tilted by 10 deg: 0.4 m ahead of it.
-BASE_TO_CAMERA = (0.4, -0.1, 0.3, *(Rotation.from_euler('y', 10.0, degrees=True)
-                                    * Rotation.from_quat((-0.5, 0.5, -0.5, 0.5))).as_quat())
+BASE_TO_CAMERA = (
+    0.4,
+    -0.1,
+    0.3,
+    *(
+        Rotation.from_euler('y', 10.0, degrees=True) * Rotation.from_quat((-0.5, 0.5, -0.5, 0.5))
+    ).as_quat(),
+)
 BASE = Base.of('base_link', BASE_TO_CAMERA)
 OF_BASE = PARAMETERS.updated({'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA})
 
@@ -354,18 +439,24 @@ def test_the_base_moves_with_the_camera(tracked, of_base):
     assert len(of_base[1]) == len(tracked[1])
     first = BASE.camera(of_base[1][0])
     G = first.R @ tracked[1][0].R.T
-    assert G[2, 2] == pytest.approx(1.0, abs=1e-6)   # z is up in both
+    assert G[2, 2] == pytest.approx(1.0, abs=1e-6)  # z is up in both
     for camera, base in zip(tracked[1], of_base[1], strict=True):
         assert (camera.frame_id, base.frame_id) == ('camera', 'base_link')
         carried = BASE.camera(base)
         np.testing.assert_allclose(carried.R, G @ camera.R, atol=1e-4)
-        np.testing.assert_allclose(carried.position - first.position,
-                                   G @ (camera.position - tracked[1][0].position), atol=2e-3)
-        np.testing.assert_allclose(base.angular_velocity, BASE.R @ camera.angular_velocity,
-                                   atol=1e-4)
+        np.testing.assert_allclose(
+            carried.position - first.position,
+            G @ (camera.position - tracked[1][0].position),
+            atol=2e-3,
+        )
+        np.testing.assert_allclose(
+            base.angular_velocity, BASE.R @ camera.angular_velocity, atol=1e-4
+        )
         np.testing.assert_allclose(
             base.velocity + np.cross(base.angular_velocity, BASE.position),
-            BASE.R @ camera.velocity, atol=2e-3)
+            BASE.R @ camera.velocity,
+            atol=2e-3,
+        )
 
 
 def test_the_base_starts_at_the_origin_with_x_forward(of_base):
@@ -391,32 +482,52 @@ def test_covariances_of_the_base_are_those_of_samples(of_base):
     published = odometry(replace(state, covariance=P))
     poses, twists = [], []
     for d in np.random.default_rng(5).multivariate_normal(np.zeros(18), P, 4000):
-        one = odometry(replace(
-            state, R=state.R @ exp_so3(d[:3]), position=state.position + state.R @ d[3:6],
-            velocity=state.velocity + d[6:9], gyro_bias=state.gyro_bias + d[12:15],
-            arm=state.arm + d[15:]))
+        one = odometry(
+            replace(
+                state,
+                R=state.R @ exp_so3(d[:3]),
+                position=state.position + state.R @ d[3:6],
+                velocity=state.velocity + d[6:9],
+                gyro_bias=state.gyro_bias + d[12:15],
+                arm=state.arm + d[15:],
+            )
+        )
         turn = Rotation.from_matrix(one.R @ published.R.T).as_rotvec()
         poses.append([*(one.position - published.position), *turn])
-        twists.append([*(one.velocity - published.velocity),
-                       *(one.angular_velocity - published.angular_velocity)])
-    for samples, claimed in ((poses, published.pose_covariance),
-                             (twists, published.velocity_covariance)):
+        twists.append(
+            [
+                *(one.velocity - published.velocity),
+                *(one.angular_velocity - published.angular_velocity),
+            ]
+        )
+    for samples, claimed in (
+        (poses, published.pose_covariance),
+        (twists, published.velocity_covariance),
+    ):
         sigmas = np.sqrt(np.diag(claimed))
-        np.testing.assert_allclose(np.cov(np.transpose(samples)) / np.outer(sigmas, sigmas),
-                                   claimed / np.outer(sigmas, sigmas), atol=0.08)
+        np.testing.assert_allclose(
+            np.cov(np.transpose(samples)) / np.outer(sigmas, sigmas),
+            claimed / np.outer(sigmas, sigmas),
+            atol=0.08,
+        )
 
 
 def test_without_the_position_of_the_camera_on_the_base_nothing_starts(walked):
-    estimator, out = run(walked, pairs=walked.pairs[:15], estimator=OdometryEstimator(
-        PARAMETERS.updated({'base_frame': 'base_link'})))
+    estimator, out = run(
+        walked,
+        pairs=walked.pairs[:15],
+        estimator=OdometryEstimator(PARAMETERS.updated({'base_frame': 'base_link'})),
+    )
     assert out == []
     assert estimator.blocking_reason.startswith(
-        'the camera is not known in base_frame base_link: publish their static transform')
+        'the camera is not known in base_frame base_link: publish their static transform'
+    )
     estimator.base = BASE
     assert run(walked, pairs=walked.pairs[15:30], estimator=estimator)[1]
 
 
 # --- faults
+
 
 def contradicting(pairs):
     bad = len(pairs) - 12
@@ -430,7 +541,9 @@ FAULTS = {
     'a contradicting pair': (lambda w: (contradicting(w.pairs), w.samples), (1, 0, 1)),
     'a second without images': (lambda w: (without(w.pairs, 4, 5), w.samples), (0, 0, 1)),
     'a gap of the IMU': (
-        lambda w: (w.pairs, samples_of(w, -1.0, 6.0) + samples_of(w, 6.4, 13.0)), (0, 1, 2)),
+        lambda w: (w.pairs, samples_of(w, -1.0, 6.0) + samples_of(w, 6.4, 13.0)),
+        (0, 1, 2),
+    ),
 }
 
 
@@ -439,8 +552,11 @@ def test_the_path_continues_after_a_fault(walked, fault):
     change, counts = FAULTS[fault]
     pairs, samples = change(walked)
     estimator, out = run(walked, pairs=pairs, samples=samples)
-    assert (estimator.counts['contradicting'], estimator.counts['lost'],
-            len(estimator.starts)) == counts
+    assert (
+        estimator.counts['contradicting'],
+        estimator.counts['lost'],
+        len(estimator.starts),
+    ) == counts
     assert out[-1].path == estimator.counts['lost']
     for path in range(counts[2]):
         assert ate([keyframe for keyframe in out if keyframe.path == path], walked.truth) < 0.1
@@ -448,9 +564,13 @@ def test_the_path_continues_after_a_fault(walked, fault):
 
 def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
-    pairs = [pair if seconds_of(pair.current_ns) < 6.0
-             else replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
-             for pair in walked.pairs if seconds_of(pair.current_ns) < 10.0]
+    pairs = [
+        pair
+        if seconds_of(pair.current_ns) < 6.0
+        else replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
+        for pair in walked.pairs
+        if seconds_of(pair.current_ns) < 10.0
+    ]
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['contradicting'] > 5
     longest = PARAMETERS.odometry.max_coast + INTERVAL
@@ -462,9 +582,15 @@ def test_pairs_that_are_wrong_together_count_by_their_innovations():
     """Directions that are off by 9 deg for 2.5 s: chi squared of the position."""
     given, squares = walk('walk:7', 7.0, imu_rate=100.0), []
     turn = exp_so3(np.array([0.0, 0.0, 0.16]))
-    _, out = run(given, pairs=[
-        replace(pair, images=replace(pair.images, t=turn @ pair.images.t))
-        if 4.0 < seconds_of(pair.current_ns) < 6.5 else pair for pair in given.pairs])
+    _, out = run(
+        given,
+        pairs=[
+            replace(pair, images=replace(pair.images, t=turn @ pair.images.t))
+            if 4.0 < seconds_of(pair.current_ns) < 6.5
+            else pair
+            for pair in given.pairs
+        ],
+    )
     for one in out[1:]:
         _, way = given.truth.relative_pose(out[0].imu_ns, one.imu_ns)
         error = out[0].R.T @ (one.position - out[0].position) - way
@@ -477,8 +603,12 @@ def test_pairs_that_are_wrong_together_count_by_their_innovations():
 def test_the_end_of_a_path_at_a_keyframe_is_no_gap_of_the_imu(walked):
     """The next pair starts where the last one ended: the interval between them is empty."""
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
-    pairs = [replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
-             if 6.0 < seconds_of(pair.current_ns) < 8.2 else pair for pair in walked.pairs]
+    pairs = [
+        replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
+        if 6.0 < seconds_of(pair.current_ns) < 8.2
+        else pair
+        for pair in walked.pairs
+    ]
     _, out = run(walked, pairs=pairs)
     later = [keyframe for keyframe in out if keyframe.path == 1]
     assert later
@@ -494,10 +624,16 @@ def test_pairs_without_information_are_no_keyframes(walked, tracked):
             pairs.append(pair)
             continue
         # One for each frame, as where nothing can be matched.
-        pairs += [replace(pair, status='TOO_FEW_MATCHES', images=None,
-                          reference_ns=pair.reference_ns + k * SECOND // 30,
-                          current_ns=pair.reference_ns + (k + 1) * SECOND // 30)
-                  for k in range(4)]
+        pairs += [
+            replace(
+                pair,
+                status='TOO_FEW_MATCHES',
+                images=None,
+                reference_ns=pair.reference_ns + k * SECOND // 30,
+                current_ns=pair.reference_ns + (k + 1) * SECOND // 30,
+            )
+            for k in range(4)
+        ]
     parameters = PARAMETERS.updated({'max_coast': 10.0})
     estimator, out = run(walked, pairs=pairs, estimator=OdometryEstimator(parameters, keep=True))
     assert not [k for k in out if 4.1 < seconds_of(k.imu_ns) < 6.4]
@@ -508,17 +644,27 @@ def test_pairs_without_information_are_no_keyframes(walked, tracked):
     assert seconds_of(uncertain.begin_ns) == pytest.approx(4.35, abs=0.15)
     assert seconds_of(uncertain.end_ns) == pytest.approx(6.6, abs=0.2)
     # Two seconds later velocities are as well known as without the disturbance.
-    disturbed, undisturbed = (math.sqrt(np.trace(min(
-        keyframes, key=lambda k: abs(seconds_of(k.imu_ns) - 8.5)).velocity_covariance[:3, :3]))
-        for keyframes in (out, tracked[1]))
+    disturbed, undisturbed = (
+        math.sqrt(
+            np.trace(
+                min(keyframes, key=lambda k: abs(seconds_of(k.imu_ns) - 8.5)).velocity_covariance[
+                    :3, :3
+                ]
+            )
+        )
+        for keyframes in (out, tracked[1])
+    )
     assert disturbed < 1.2 * undisturbed
 
 
 def test_a_sigma_beyond_its_limit_is_lost(walked):
     for name, limit in (('max_position_sigma', 0.015), ('max_heading_sigma', 0.001)):
         parameters = PARAMETERS.updated({name: limit, 'gyro_noise_density': 1e-3})
-        estimator, _ = run(walked, pairs=without(walked.pairs, 6.0, 7.9),
-                           estimator=OdometryEstimator(parameters, keep=True))
+        estimator, _ = run(
+            walked,
+            pairs=without(walked.pairs, 6.0, 7.9),
+            estimator=OdometryEstimator(parameters, keep=True),
+        )
         quantity = name.split('_')[1]
         lost, *_ = (one for one in estimator.intervals if one.state is OdometryState.LOST)
         assert lost.reason.startswith(f'the {quantity} is known to ')
@@ -556,7 +702,8 @@ def test_the_published_path_is_continuous_and_increasing(walked, delay):
         way = 0.5 * seconds * (before.R @ before.velocity + after.R @ after.velocity)
         # Of a correction, the tenth that is blended in at once.
         assert np.linalg.norm(after.position - before.position - way) < 0.001 + 0.15 * math.sqrt(
-            np.trace(before.pose_covariance[:3, :3]))
+            np.trace(before.pose_covariance[:3, :3])
+        )
 
 
 def test_a_graph_that_is_not_solved_is_lost_and_the_path_continues(walked, monkeypatch):
@@ -565,7 +712,7 @@ def test_a_graph_that_is_not_solved_is_lost_and_the_path_continues(walked, monke
 
         def update(self, factors, *others):
             Flaky.updates += 1
-            if Flaky.updates == 100:   # ten with each pair before the start
+            if Flaky.updates == 100:  # ten with each pair before the start
                 raise RuntimeError('\nIndeterminant linear system\nwhile working near x50')
             return super().update(factors, *others)
 
@@ -600,7 +747,8 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
     assert any('lost' in message for message in estimator.warnings())
     before, after = ([k for k in out if k.path == path] for path in (0, 1))
     assert np.trace(after[0].pose_covariance[:3, :3]) > np.trace(
-        before[-1].pose_covariance[:3, :3])
+        before[-1].pose_covariance[:3, :3]
+    )
     for part in (before, after):
         assert ate(part, walked.truth) < 0.05
     _, t = walked.truth.relative_pose(before[-1].imu_ns, after[0].imu_ns)
@@ -612,18 +760,33 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
 @pytest.mark.parametrize('seconds', [-100.0, -0.5, 0.5])
 def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
     jump, at = round(seconds * SECOND), seconds_of(walked.pairs[39].current_ns)
-    estimator, first = run(walked, pairs=walked.pairs[:40],
-                           samples=samples_of(walked, -1.0, at + 0.03),
-                           estimator=OdometryEstimator(PARAMETERS))
-    pairs = [replace(pair, stamp_ns=pair.stamp_ns + jump, reference_ns=pair.reference_ns + jump,
-                     current_ns=pair.current_ns + jump) for pair in walked.pairs[40:]]
-    samples = [replace(sample, stamp_ns=sample.stamp_ns + jump)
-               for sample in samples_of(walked, at + 0.03, 13.0)]
+    estimator, first = run(
+        walked,
+        pairs=walked.pairs[:40],
+        samples=samples_of(walked, -1.0, at + 0.03),
+        estimator=OdometryEstimator(PARAMETERS),
+    )
+    pairs = [
+        replace(
+            pair,
+            stamp_ns=pair.stamp_ns + jump,
+            reference_ns=pair.reference_ns + jump,
+            current_ns=pair.current_ns + jump,
+        )
+        for pair in walked.pairs[40:]
+    ]
+    samples = [
+        replace(sample, stamp_ns=sample.stamp_ns + jump)
+        for sample in samples_of(walked, at + 0.03, 13.0)
+    ]
     estimator, second = run(walked, pairs=pairs, samples=samples, estimator=estimator)
     assert estimator.counts['lost'] == 1
     [lost] = [text for text in estimator.warnings() if text.startswith('lost')]
-    assert lost == 'lost: ' + ('the clock of the IMU was set back' if seconds < 0.0 else
-                               'the IMU has a gap, or its clock jumped: see its driver')
+    assert lost == 'lost: ' + (
+        'the clock of the IMU was set back'
+        if seconds < 0.0
+        else 'the IMU has a gap, or its clock jumped: see its driver'
+    )
     assert len(second) > 0.6 * len(pairs)
     for after in second:
         _, t = walked.truth.relative_pose(first[-1].imu_ns, after.imu_ns - jump)
@@ -641,8 +804,12 @@ def test_samples_that_come_far_too_late_are_left_out(walked, tracked):
 
 def test_pairs_of_another_camera_are_refused(walked):
     other = [replace(pair, frame_id='rear_camera') for pair in walked.pairs]
-    estimator, _ = run(walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, 3.1),
-                         estimator=OdometryEstimator(PARAMETERS))
+    estimator, _ = run(
+        walked,
+        pairs=walked.pairs[:20],
+        samples=samples_of(walked, -1.0, 3.1),
+        estimator=OdometryEstimator(PARAMETERS),
+    )
     with pytest.raises(InputError, match='remap relpose_node/pairs to those of one camera'):
         estimator.add_pair(other[20])
     assert estimator.state is OdometryState.TRACKING
@@ -652,10 +819,14 @@ def test_pairs_of_another_camera_are_refused(walked):
 
 @pytest.mark.parametrize('apart', [-100, 5, 100])
 def test_a_path_is_lost_where_the_camera_has_another_clock(walked, apart):
-    estimator, _ = run(walked, pairs=walked.pairs[:20], estimator=OdometryEstimator(PARAMETERS),
-                       samples=samples_of(walked, -1.0, 3.1))
+    estimator, _ = run(
+        walked,
+        pairs=walked.pairs[:20],
+        estimator=OdometryEstimator(PARAMETERS),
+        samples=samples_of(walked, -1.0, 3.1),
+    )
     pairs = [pair.later(apart * SECOND) for pair in walked.pairs[20:34]]
-    if apart == 5:   # they may still be right
+    if apart == 5:  # they may still be right
         estimator.add_pair(pairs.pop())
     for pair in pairs if abs(apart) > 10 else ():
         with pytest.raises(InputError, match='camera and IMU must have one clock'):
@@ -667,38 +838,60 @@ def test_a_path_is_lost_where_the_camera_has_another_clock(walked, apart):
 @pytest.mark.parametrize('turn', [10.0, 90.0])
 def test_an_imu_of_another_frame_gives_no_path_and_the_reason(walked, turn):
     R = Rotation.from_euler('x', turn, degrees=True)
-    samples = [replace(sample, angular_velocity=tuple(R.apply(sample.angular_velocity)),
-                       linear_acceleration=tuple(R.apply(sample.linear_acceleration)))
-               for sample in samples_of(walked, -1.0, 6.0)]
+    samples = [
+        replace(
+            sample,
+            angular_velocity=tuple(R.apply(sample.angular_velocity)),
+            linear_acceleration=tuple(R.apply(sample.linear_acceleration)),
+        )
+        for sample in samples_of(walked, -1.0, 6.0)
+    ]
     # From 3.1 s on at rest, where axes do not show, to 4.5 s.
     for begin in (0.0, 3.1):
         estimator, out = run(
-            walked, samples=samples, estimator=OdometryEstimator(PARAMETERS),
-            pairs=[pair for pair in walked.pairs[:38] if seconds_of(pair.reference_ns) > begin])
+            walked,
+            samples=samples,
+            estimator=OdometryEstimator(PARAMETERS),
+            pairs=[pair for pair in walked.pairs[:38] if seconds_of(pair.reference_ns) > begin],
+        )
         assert [k for k in out if not 3.0 < seconds_of(k.imu_ns) < 5.5] == []
         assert not (out and begin == 0.0)
         assert estimator.reason.startswith('pairs and IMU contradict each other')
-        assert [text for text in (*estimator.warnings(), estimator.blocking_reason)
-                if 'quat_cam_imu_xyzw' in text]
+        assert [
+            text
+            for text in (*estimator.warnings(), estimator.blocking_reason)
+            if 'quat_cam_imu_xyzw' in text
+        ]
 
 
 def test_pairs_that_are_wrong_together_do_not_disprove_axes(walked):
     """As of a moving object; before 20 pairs have agreed with the IMU they do."""
     finding = 'accel_axes suspect: accelerometer inconsistent with the images'
     for begin, lost in ((2.0, 1), (8.0, 0)):
-        estimator, out = run(walked, pairs=[
-            replace(pair, contradiction=finding) if 0.0 < seconds_of(pair.current_ns) - begin < 1.0
-            else pair for pair in walked.pairs])
+        estimator, out = run(
+            walked,
+            pairs=[
+                replace(pair, contradiction=finding)
+                if 0.0 < seconds_of(pair.current_ns) - begin < 1.0
+                else pair
+                for pair in walked.pairs
+            ],
+        )
         assert (estimator.counts['lost'], len(estimator.starts)) == (lost, 1 + lost)
         assert ate([one for one in out if one.path == lost], walked.truth) < 0.05
 
 
 def test_loss_is_reported_without_further_pairs(walked):
     last = seconds_of(walked.pairs[19].current_ns)
-    for age, state in ((0.2, OdometryState.TRACKING), (0.31, OdometryState.UNCERTAIN),
-                       (1.9, OdometryState.UNCERTAIN), (2.1, OdometryState.LOST)):
-        estimator, _ = run(walked, pairs=walked.pairs[:20],
-                           samples=samples_of(walked, -1.0, last + age))
+    for age, state in (
+        (0.2, OdometryState.TRACKING),
+        (0.31, OdometryState.UNCERTAIN),
+        (1.9, OdometryState.UNCERTAIN),
+        (2.1, OdometryState.LOST),
+    ):
+        estimator, _ = run(
+            walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, last + age)
+        )
         assert estimator.state is state, age
     assert estimator.counts['lost'] == 1
     assert estimator.warnings()[-1] == 'lost: no usable pair for 2 s'
@@ -708,13 +901,20 @@ def test_loss_is_reported_without_further_pairs(walked):
     assert 1.6 < (uncertain.end_ns - uncertain.begin_ns) / SECOND < 1.8
 
 
-@pytest.mark.parametrize('frames_end, state', [
-    (0.0, OdometryState.UNCERTAIN), (0.5, OdometryState.TRACKING), (0.7, OdometryState.UNCERTAIN)])
+@pytest.mark.parametrize(
+    'frames_end, state',
+    [
+        (0.0, OdometryState.UNCERTAIN),
+        (0.5, OdometryState.TRACKING),
+        (0.7, OdometryState.UNCERTAIN),
+    ],
+)
 def test_frames_show_whether_a_pair_is_missing(walked, frames_end, state):
     """Frames at 30 Hz until `frames_end` after a pair: slow motion, or a camera that stops."""
     last = seconds_of(walked.pairs[19].current_ns)
-    estimator, _ = run(walked, pairs=walked.pairs[:20],
-                       samples=samples_of(walked, -1.0, last + 0.1))
+    estimator, _ = run(
+        walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, last + 0.1)
+    )
     frames = list(np.arange(last - 0.5, last + frames_end, 1.0 / 30.0))
     for sample in samples_of(walked, last + 0.1, last + max(frames_end, 0.31)):
         while frames and frames[0] <= seconds_of(sample.stamp_ns):
@@ -726,14 +926,20 @@ def test_frames_show_whether_a_pair_is_missing(walked, frames_end, state):
 def test_no_images_for_longer_than_the_window(walked, tracked):
     """The first pairs after a bridge contradict nothing, and velocities are right again."""
     parameters = PARAMETERS.updated({'max_coast': 10.0, 'max_position_sigma': 3.0})
-    estimator, out = run(walked, pairs=without(walked.pairs, 3.5, 9.0),
-                         estimator=OdometryEstimator(parameters, keep=True))
+    estimator, out = run(
+        walked,
+        pairs=without(walked.pairs, 3.5, 9.0),
+        estimator=OdometryEstimator(parameters, keep=True),
+    )
     assert (estimator.counts['contradicting'], estimator.counts['lost']) == (0, 0)
     for keyframe in out[-5:]:
         undisturbed = next(k for k in tracked[1] if k.imu_ns == keyframe.imu_ns)
         error = keyframe.R @ keyframe.velocity - undisturbed.R @ undisturbed.velocity
-        assert np.linalg.norm(error) < 4.0 * math.sqrt(np.trace(
-            keyframe.velocity_covariance[:3, :3] + undisturbed.velocity_covariance[:3, :3]))
+        assert np.linalg.norm(error) < 4.0 * math.sqrt(
+            np.trace(
+                keyframe.velocity_covariance[:3, :3] + undisturbed.velocity_covariance[:3, :3]
+            )
+        )
 
 
 def test_earlier_losses_stay_in_the_covariance(walked):
@@ -758,13 +964,13 @@ def test_pairs_without_imu_do_not_accumulate(walked):
 def test_memory_is_constant_unless_the_path_is_kept(walked):
     estimator, sizes, begin = OdometryEstimator(PARAMETERS), [], -1.0
     for k in range(0, 60, 20):
-        pairs = walked.pairs[k:k + 20]
+        pairs = walked.pairs[k : k + 20]
         end = seconds_of(pairs[-1].current_ns) + 0.1
         run(walked, estimator=estimator, pairs=pairs, samples=samples_of(walked, begin, end))
         begin = end
         sizes.append(objects_behind(estimator))
     assert estimator.state is OdometryState.TRACKING
-    assert sizes[2] - sizes[1] < 5   # a small int is one object, however often it is referenced
+    assert sizes[2] - sizes[1] < 5  # a small int is one object, however often it is referenced
 
 
 def objects_behind(root) -> int:
@@ -780,12 +986,15 @@ def objects_behind(root) -> int:
 
 def test_memory_is_constant_without_pairs():
     estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
-    for k in range(12_000):   # two minutes
+    for k in range(12_000):  # two minutes
         if k % 4000 == 0:
             sizes.append(len(pickle.dumps(estimator)))
-        estimator.add_imu(ImuSample(START_NS + k * SECOND // 100, tuple(rng.normal(size=3)),
-                                    tuple(rng.normal(size=3))))
-    assert sizes[0] < sizes[1] and abs(sizes[2] - sizes[1]) < 2000   # pruned each 50 ms
+        estimator.add_imu(
+            ImuSample(
+                START_NS + k * SECOND // 100, tuple(rng.normal(size=3)), tuple(rng.normal(size=3))
+            )
+        )
+    assert sizes[0] < sizes[1] and abs(sizes[2] - sizes[1]) < 2000  # pruned each 50 ms
 
 
 def test_without_gtsam_the_error_has_the_command_to_install_it(monkeypatch):
@@ -796,22 +1005,25 @@ def test_without_gtsam_the_error_has_the_command_to_install_it(monkeypatch):
 
 # --- files
 
+
 def test_the_plot_has_one_time_axis_and_the_whole_truth(walked, tracked, tmp_path):
     """A live path starts later than the smoothed one, and the truth may end before both."""
     estimator, out = tracked
     paths = {'live': out, 'smoothed': estimator.smoothed()}
     known = [at for at in walked.stamps.tolist() if seconds_of(at) < 9.0]
-    truth = TrueTrajectory(known, walked.positions[:len(known)], walked.quats[:len(known)])
-    picture = draw_paths({name: path_of(path, truth) for name, path in paths.items()},
-                         tmp_path / 'path.png')
+    truth = TrueTrajectory(known, walked.positions[: len(known)], walked.quats[: len(known)])
+    picture = draw_paths(
+        {name: path_of(path, truth) for name, path in paths.items()}, tmp_path / 'path.png'
+    )
     lines = {line.get_label(): line for line in picture.axes[1].get_lines()}
     assert list(lines) == ['truth', 'live', 'smoothed']
     first_ns = paths['smoothed'][0].imu_ns
     assert out[0].imu_ns > first_ns + SECOND // 5
     for name, path in (*paths.items(), ('truth', paths['smoothed'])):
         at = [keyframe.imu_ns for keyframe in path if seconds_of(keyframe.imu_ns) < 9.0]
-        np.testing.assert_allclose(lines[name].get_xdata(), [(ns - first_ns) / SECOND
-                                                             for ns in at], atol=1e-9)
+        np.testing.assert_allclose(
+            lines[name].get_xdata(), [(ns - first_ns) / SECOND for ns in at], atol=1e-9
+        )
         true = np.array([walked.truth.position(ns)[2] for ns in at])
         np.testing.assert_allclose(lines[name].get_ydata(), true, atol=0.05)
 
@@ -824,5 +1036,6 @@ def test_tum_files_are_exact_to_the_nanosecond(tracked, tmp_path):
     seconds, *values = lines[-1].split()
     assert int(seconds.replace('.', '')) == out[-1].stamp_ns
     np.testing.assert_allclose([float(x) for x in values[:3]], out[-1].position, atol=1e-8)
-    np.testing.assert_allclose(Rotation.from_quat([float(x) for x in values[3:]]).as_matrix(),
-                               out[-1].R, atol=1e-7)
+    np.testing.assert_allclose(
+        Rotation.from_quat([float(x) for x in values[3:]]).as_matrix(), out[-1].R, atol=1e-7
+    )

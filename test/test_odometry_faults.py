@@ -75,11 +75,17 @@ PAIR_DELAY, IMU_DELAY = 0.06, 0.002
 # Longest start in motion, and the delay of a message, on a busy machine too.
 START = 1.6
 # Where all is good again, by the fault before; up to the next one.
-GOOD = {'none': (START, CAMERA_STOPS[0]), 'camera stops': (CAMERA_STOPS[1] + START, WRONG[0]),
-        'told wrong': (WRONG[1] + START, RESET), 'reset': (RESET + START, END)}
+GOOD = {
+    'none': (START, CAMERA_STOPS[0]),
+    'camera stops': (CAMERA_STOPS[1] + START, WRONG[0]),
+    'told wrong': (WRONG[1] + START, RESET),
+    'reset': (RESET + START, END),
+}
 # Without publication: after `max_coast`, and while a parameter is known to be wrong.
-QUIET = {'camera stops': (CAMERA_STOPS[0] + 2.0 + 0.2, CAMERA_STOPS[1]),
-         'told wrong': (WRONG[0] + 0.3, WRONG[1])}
+QUIET = {
+    'camera stops': (CAMERA_STOPS[0] + 2.0 + 0.2, CAMERA_STOPS[1]),
+    'told wrong': (WRONG[0] + 0.3, WRONG[1]),
+}
 WRONG_HEALTH = Assessment((Finding('time_offset', FindingState.WRONG, 'off'),))
 
 
@@ -88,8 +94,9 @@ def within(seconds: float, span: tuple[float, float]) -> bool:
 
 
 def imu_message(sample: ImuSample) -> Imu:
-    return build.imu(build.rclpy_types, sample.stamp_ns, sample.angular_velocity,
-                     sample.linear_acceleration)
+    return build.imu(
+        build.rclpy_types, sample.stamp_ns, sample.angular_velocity, sample.linear_acceleration
+    )
 
 
 def pairs_message(pair: KeyframePair, health: Assessment) -> Any:
@@ -101,20 +108,50 @@ def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
     pose = RelativePose(Status(pair.status))
     if pair.images is not None:
         zero, eye = np.zeros(3), np.eye(6)
-        pose = replace(pose, R=pair.images.R, t=pair.images.t, images=pair.images,
-                       linear_velocity1=zero, linear_velocity2=zero, angular_velocity1=zero,
-                       angular_velocity2=zero, covariance=1e-6 * eye, velocity_covariance=eye,
-                       baseline=pair.baseline, baseline_log_sigma=pair.baseline_log_sigma)
+        pose = replace(
+            pose,
+            R=pair.images.R,
+            t=pair.images.t,
+            images=pair.images,
+            linear_velocity1=zero,
+            linear_velocity2=zero,
+            angular_velocity1=zero,
+            angular_velocity2=zero,
+            covariance=1e-6 * eye,
+            velocity_covariance=eye,
+            baseline=pair.baseline,
+            baseline_log_sigma=pair.baseline_log_sigma,
+        )
     none = np.zeros((0, 3))
     return PairResult(
-        pair.reference_ns, pair.stamp_ns, pair.reference_ns, pair.current_ns, pair.frame_id, 0.15,
-        pose, Matches.none(), none[:, 0], none[:, 0], none, none, 10.0,
-        lambda: Landmarks(none[:, :2], none[:, :2], none), gyro_bias=pair.gyro_bias, health=health)
+        pair.reference_ns,
+        pair.stamp_ns,
+        pair.reference_ns,
+        pair.current_ns,
+        pair.frame_id,
+        0.15,
+        pose,
+        Matches.none(),
+        none[:, 0],
+        none[:, 0],
+        none,
+        none,
+        10.0,
+        lambda: Landmarks(none[:, :2], none[:, :2], none),
+        gyro_bias=pair.gyro_bias,
+        health=health,
+    )
 
 
-@pytest.mark.parametrize('quantity, state, stops', [
-    ('accel_axes', FindingState.SUSPECT, True), ('accel_axes', FindingState.OK, False),
-    ('time_offset', FindingState.SUSPECT, False), ('time_offset', FindingState.WRONG, True)])
+@pytest.mark.parametrize(
+    'quantity, state, stops',
+    [
+        ('accel_axes', FindingState.SUSPECT, True),
+        ('accel_axes', FindingState.OK, False),
+        ('time_offset', FindingState.SUSPECT, False),
+        ('time_offset', FindingState.WRONG, True),
+    ],
+)
 def test_a_contradicted_accelerometer_stops_the_path(quantity, state, stops):
     health = Assessment((Finding(quantity, state, 'because'),))
     pair = walk('walk:2', 1.0).pairs[0]
@@ -169,16 +206,25 @@ def vector_of(value: Any) -> np.ndarray:
 def positions_of(published: list[Odometry], base: Base | None = None) -> np.ndarray:
     """Positions, with a `base` those of the camera on it."""
     on_base = np.zeros(3) if base is None else base.position
-    return np.array([vector_of(pose.position) + rotation_of(pose) @ on_base
-                     for pose in (one.pose.pose for one in published)])
+    return np.array(
+        [
+            vector_of(pose.position) + rotation_of(pose) @ on_base
+            for pose in (one.pose.pose for one in published)
+        ]
+    )
 
 
 def rotation_of(pose: Any) -> np.ndarray:
     return Rotation.from_quat(vector_of(pose.orientation)).as_matrix()
 
 
-def assert_metric(published: list[Odometry], truth: TrueTrajectory, ate: float,
-                  scale_error: float, base: Base | None = None) -> np.ndarray:
+def assert_metric(
+    published: list[Odometry],
+    truth: TrueTrajectory,
+    ate: float,
+    scale_error: float,
+    base: Base | None = None,
+) -> np.ndarray:
     """RMS error [m] and scale after alignment, the rotation of which is returned."""
     known = [message for message in published if truth.covers(stamp_of(message))]
     true = np.array([truth.position(stamp_of(message)) for message in known])
@@ -193,24 +239,39 @@ def session(module_ros_domain_id: int) -> Iterator[SimpleNamespace]:
     """What the node published during the walk; `published` of a span of it."""
     given = walk(f'walk:{END + 1:g}', END, imu_rate=IMU_RATE)
     events = sorted(stream(given), key=lambda event: event[0])
-    parameters = {'quat_cam_imu_xyzw': list(QUAT), 'imu_position': list(LEVER),
-                  'gyro_bias': list(PARAMETERS.imu.gyro_bias), 'max_coast': 2.0,
-                  # A busy machine must not lose samples: that is not what is tested.
-                  f'qos_overrides.{BAG_TOPICS["imu"]}.subscription.reliability': 'reliable'}
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap={'imu': BAG_TOPICS['imu']}, parameters=parameters,
-            node='odometry_node') as node:
+    parameters = {
+        'quat_cam_imu_xyzw': list(QUAT),
+        'imu_position': list(LEVER),
+        'gyro_bias': list(PARAMETERS.imu.gyro_bias),
+        'max_coast': 2.0,
+        # A busy machine must not lose samples: that is not what is tested.
+        f'qos_overrides.{BAG_TOPICS["imu"]}.subscription.reliability': 'reliable',
+    }
+    with (
+        Graph() as graph,
+        node_process(
+            BUNDLED_PARAMETERS,
+            remap={'imu': BAG_TOPICS['imu']},
+            parameters=parameters,
+            node='odometry_node',
+        ) as node,
+    ):
         received = graph.listen(Odometry, f'{OWN}/odometry')
         paths = graph.listen(PathMessage, f'{OWN}/path')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
         graph.wait_for_publisher(f'{OWN}/odometry')
-        publishers = {DiagnosticArray: graph.publisher(DiagnosticArray, '/relpose_node/pairs'),
-                      Imu: graph.publisher(Imu, BAG_TOPICS['imu'])}
+        publishers = {
+            DiagnosticArray: graph.publisher(DiagnosticArray, '/relpose_node/pairs'),
+            Imu: graph.publisher(Imu, BAG_TOPICS['imu']),
+        }
 
         def play(begin: float, end: float) -> None:
-            publish_in_time((publishers[type(message)], round(at * SECOND / FASTER), message)
-                            for at, message in events if begin <= at < end)
+            publish_in_time(
+                (publishers[type(message)], round(at * SECOND / FASTER), message)
+                for at, message in events
+                if begin <= at < end
+            )
 
         play(-math.inf, RESET)
         wait_until_quiet(lambda: len(received), 1.0, node)
@@ -223,10 +284,17 @@ def session(module_ros_domain_id: int) -> Iterator[SimpleNamespace]:
         assert node.signal(signal.SIGINT)[0] == 0
         print(node.output)
         yield SimpleNamespace(
-            walk=given, diagnostics=diagnostics, output=node.output, reset=reset,
-            path_after_reset=paths[-1], published=lambda span: [
-                message for message in received
-                if within((stamp_of(message) - START_NS) / SECOND, span)])
+            walk=given,
+            diagnostics=diagnostics,
+            output=node.output,
+            reset=reset,
+            path_after_reset=paths[-1],
+            published=lambda span: [
+                message
+                for message in received
+                if within((stamp_of(message) - START_NS) / SECOND, span)
+            ],
+        )
 
 
 @pytest.mark.parametrize('fault', GOOD)
@@ -244,28 +312,36 @@ def test_nothing_is_published_without_a_pose(session, fault):
 
 def test_faults_are_reported(session):
     lines = session.output.splitlines()
-    for expected in ('uncertain: no usable pair for 0.', 'lost: no usable pair for 2 s',
-                     'lost: time_offset wrong: off'):
+    for expected in (
+        'uncertain: no usable pair for 0.',
+        'lost: no usable pair for 2 s',
+        'lost: time_offset wrong: off',
+    ):
         [line] = [line for line in lines if expected in line]
         assert line.startswith('[ERROR]') == expected.startswith('lost')
     assert 'Traceback' not in session.output
     [status] = session.diagnostics[-1].status
-    assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s and '
-                        rf'{BAG_TOPICS["imu"]} for \d+ s: start or remap what publishes it .*',
-                        status.message)
+    assert re.fullmatch(
+        r'no message on /relpose_node/pairs for \d+ s and '
+        rf'{BAG_TOPICS["imu"]} for \d+ s: start or remap what publishes it .*',
+        status.message,
+    )
     values = diagnostic_values(session.diagnostics[-1])
     assert values['lost'] == '2'
     assert int(values['calibration_contradicted']) >= 3
-    assert values['state'] == 'lost'   # the IMU is silent
+    assert values['state'] == 'lost'  # the IMU is silent
 
 
 def test_the_imu_propagates_the_path_while_the_camera_stops(session):
-    ends = [session.published((0.0, CAMERA_STOPS[0]))[-1],
-            session.published((CAMERA_STOPS[1], WRONG[0]))[0]]
+    ends = [
+        session.published((0.0, CAMERA_STOPS[0]))[-1],
+        session.published((CAMERA_STOPS[1], WRONG[0]))[0],
+    ]
     true = [session.walk.truth.position(stamp_of(message)) for message in ends]
     sigmas = [math.sqrt(sum(message.pose.covariance[k] for k in (0, 7, 14))) for message in ends]
-    error = np.linalg.norm(np.diff(positions_of(ends), axis=0)) - np.linalg.norm(np.diff(
-        true, axis=0))
+    error = np.linalg.norm(np.diff(positions_of(ends), axis=0)) - np.linalg.norm(
+        np.diff(true, axis=0)
+    )
     assert abs(error) < 3.0 * sigmas[1] < 4.5
     assert sigmas[1] > 3.0 * sigmas[0]
 
@@ -282,8 +358,15 @@ def test_reset_restarts_at_the_origin(session):
 @pytest.fixture
 def own_node(ros_domain_id: int, request: pytest.FixtureRequest) -> Iterator[OdometryNode]:
     """A node in this process, which is not spun; parameter: its rate of publication."""
-    rclpy.init(args=['--ros-args', '--params-file', str(BUNDLED_PARAMETERS), '-p',
-                     f'odometry_rate:={getattr(request, "param", 30.0)}'])
+    rclpy.init(
+        args=[
+            '--ros-args',
+            '--params-file',
+            str(BUNDLED_PARAMETERS),
+            '-p',
+            f'odometry_rate:={getattr(request, "param", 30.0)}',
+        ]
+    )
     node = OdometryNode()
     yield node
     node.destroy_node()
@@ -334,10 +417,14 @@ def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float
     the twist in the base; `used` of these 12 are measured. The innovations are the mean per degree
     of freedom.
     """
+
     def measured(message):
         twist = message.twist.twist
-        return (vector_of(message.pose.pose.position), rotation_of(message.pose.pose),
-                np.concatenate([vector_of(twist.linear), vector_of(twist.angular)]))
+        return (
+            vector_of(message.pose.pose.position),
+            rotation_of(message.pose.pose),
+            np.concatenate([vector_of(twist.linear), vector_of(twist.angular)]),
+        )
 
     (p, R, w), P, nis, path = measured(messages[0]), 1e-2 * np.eye(12), [], []
     for before, message in pairwise(messages):
@@ -349,8 +436,9 @@ def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float
         P = F @ P @ F.T + np.diag([1e-8] * 6 + [9.0 * dt**2] * 6)
         z = measured(message)
         e = H @ np.concatenate([z[0] - p, log_so3(z[1] @ R.T), z[2] - w])
-        N[:6, :6], N[6:, 6:] = (np.reshape(part.covariance, (6, 6))
-                                for part in (message.pose, message.twist))
+        N[:6, :6], N[6:, 6:] = (
+            np.reshape(part.covariance, (6, 6)) for part in (message.pose, message.twist)
+        )
         S = H @ (P + N) @ H.T
         K = P @ H.T @ np.linalg.inv(S)
         x, P = K @ e, P - K @ S @ K.T
@@ -362,19 +450,26 @@ def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float
 
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------
 
+
 def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
     """Of a robot with the camera on it, at a place that tf knows."""
     (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
-    monkeypatch.setenv('TF', ' '.join(map(str, (
-        'base_link', 'camera_optical_frame', *BASE_TO_CAMERA))))
+    monkeypatch.setenv(
+        'PYTHONPATH',
+        os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]),
+    )
+    monkeypatch.setenv(
+        'TF', ' '.join(map(str, ('base_link', 'camera_optical_frame', *BASE_TO_CAMERA)))
+    )
     imu = {'imu': BAG_TOPICS['imu']}
     of_base = {'base_frame': 'base_link', 'publish_odometry_tf': True}
-    with Graph() as graph, \
-            node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS) as relpose, \
-            node_process(BUNDLED_PARAMETERS, remap=imu, parameters=of_base,
-                         node='odometry_node') as node:
+    with (
+        Graph() as graph,
+        node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS) as relpose,
+        node_process(
+            BUNDLED_PARAMETERS, remap=imu, parameters=of_base, node='odometry_node'
+        ) as node,
+    ):
         transforms = graph.listen(TransformStamped, '/sent_transform')
         received = graph.listen(Odometry, '/odometry_node/keyframes')
         propagated = graph.listen(Odometry, '/odometry_node/odometry')
@@ -385,8 +480,11 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         node.wait_for('ready')
         graph.wait_for_publisher('/odometry_node/odometry')
         # The one of this test, and the node's, which must not miss the first pair.
-        wait_until(lambda: graph.node.count_subscribers('/relpose_node/pairs') == 2,
-                   'the subscriptions', node)
+        wait_until(
+            lambda: graph.node.count_subscribers('/relpose_node/pairs') == 2,
+            'the subscriptions',
+            node,
+        )
         # Three topics of relpose_node, the IMU of odometry_node.
         with processes.player_process(bundled_bag, '--subscriptions', '4') as playing:
             assert playing.wait() == 0
@@ -400,13 +498,17 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         assert 'started' in node.output
         # The player ends before the node.
         assert 'lost' not in node.output.replace('lost: no message of the IMU', '')
-    values = [diagnostic_values(message) for message in diagnostics
-              if 'odometry_node' in message.status[0].name]
+    values = [
+        diagnostic_values(message)
+        for message in diagnostics
+        if 'odometry_node' in message.status[0].name
+    ]
     assert 'tracking' in [value['state'] for value in values]
 
     # The same pairs and samples, given to the estimator in another order.
-    parameters = read_parameters(BUNDLED_PARAMETERS).updated({
-        'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA})
+    parameters = read_parameters(BUNDLED_PARAMETERS).updated(
+        {'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA}
+    )
     estimator = OdometryEstimator(parameters)
     with open_bag(bundled_bag) as bag:
         topics = bag.find_topics()
@@ -439,8 +541,9 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
     for sent in transforms:
         assert (sent.header.frame_id, sent.child_frame_id) == ('odom', 'base_link')
         if pose := by_stamp.get(stamp_of(sent)):
-            np.testing.assert_equal(vector_of(sent.transform.translation),
-                                    vector_of(pose.position))
+            np.testing.assert_equal(
+                vector_of(sent.transform.translation), vector_of(pose.position)
+            )
 
     # A filter with the shipped configuration; pose and twist agree, and the twist alone leads
     # along the poses. Found on a replay: 2.7, and 2400 with the twist in the axes of the camera;
@@ -453,8 +556,11 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
     assert (ekf['odom_frame'], ekf['base_link_frame']) == ('odom', 'base_link')
     # A busy machine leaves gaps, in which no twist is constant.
     gaps = np.flatnonzero(np.diff([stamp_of(message) for message in propagated]) > SECOND // 10)
-    parts = [propagated[begin:end] for begin, end in pairwise([0, *(gaps + 1), len(propagated)])
-             if end - begin > 10]
+    parts = [
+        propagated[begin:end]
+        for begin, end in pairwise([0, *(gaps + 1), len(propagated)])
+        if end - begin > 10
+    ]
     assert sum(map(len, parts)) > 30
     for part in parts:
         poses = positions_of(part)[1:]
@@ -468,12 +574,14 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
 def test_the_position_of_the_imu_is_that_of_tf_before_the_path_begins():
     def placed(starts: list[Any], camera: str = 'camera') -> Any:
         node = MagicMock(_imu_lookup=lambda parent, child: (0.1, 0.2, 0.3, *QUAT))
-        node._settings.current = PARAMETERS.updated({'imu_position': (0.0, 0.0, 0.0),
-                                                     'quat_cam_imu_xyzw': tuple(QUAT)})
+        node._settings.current = PARAMETERS.updated(
+            {'imu_position': (0.0, 0.0, 0.0), 'quat_cam_imu_xyzw': tuple(QUAT)}
+        )
         node._estimator.starts = starts
         OdometryNode._place_imu(node, camera, 'imu')
         return node._settings.adopt
 
     placed([]).assert_called_once_with(
-        {'imu_position': (0.1, 0.2, 0.3), 'imu_position_sigma': 0.02})
+        {'imu_position': (0.1, 0.2, 0.3), 'imu_position_sigma': 0.02}
+    )
     assert not placed([object()]).called and not placed([], 'imu').called

@@ -22,7 +22,7 @@ from rs_relpose_ros.odometry.rows import ROWS_FILE, RowTrajectory
 from rs_relpose_ros.odometry.states import Odometry
 
 ROW_NS = round(ROW * SECOND)
-SIGMA = 1e-3   # [rad] of the loops' rotations and directions
+SIGMA = 1e-3  # [rad] of the loops' rotations and directions
 NAN = np.full(3, math.nan)
 
 
@@ -36,10 +36,16 @@ def loop_of(given, one, two, rng, *, wrong=0.0):
     information[:5, :5] = np.eye(5) / SIGMA**2
     # Velocities that contradict, as those of frames far apart do.
     information[5:, 5:] = np.eye(6) / SIGMA**2
-    images = ImageInformation(ROW, R, t / np.linalg.norm(t), np.full(6, 9.0), information,
-                              np.zeros(11))
-    return replace(given.pairs[0], stamp_ns=two.imu_ns - ROW_NS, images=images,
-                   reference_ns=one.imu_ns - ROW_NS, current_ns=two.imu_ns - ROW_NS)
+    images = ImageInformation(
+        ROW, R, t / np.linalg.norm(t), np.full(6, 9.0), information, np.zeros(11)
+    )
+    return replace(
+        given.pairs[0],
+        stamp_ns=two.imu_ns - ROW_NS,
+        images=images,
+        reference_ns=one.imu_ns - ROW_NS,
+        current_ns=two.imu_ns - ROW_NS,
+    )
 
 
 def end_error(path, truth):
@@ -56,36 +62,64 @@ def test_loops_that_agree_with_the_path_correct_it():
     wrong = [loop_of(given, *ends[k], rng, wrong=1.2) for k in (1, 4)]
     # Within the covariance of the path, but not with the right ones.
     wrong_among = [loop_of(given, *ends[k], rng, wrong=0.3) for k in (1, 4)]
-    nowhere = replace(right[0], current_ns=right[0].current_ns + 7)   # at no keyframe
+    nowhere = replace(right[0], current_ns=right[0].current_ns + 7)  # at no keyframe
     empty = replace(right[0], images=None)
     assert estimator.close_loops([*wrong, nowhere, empty]) == []
-    np.testing.assert_allclose([pose.position for pose in estimator.smoothed()],
-                               [pose.position for pose in before], atol=1e-6)
+    np.testing.assert_allclose(
+        [pose.position for pose in estimator.smoothed()],
+        [pose.position for pose in before],
+        atol=1e-6,
+    )
     taken = estimator.close_loops([*wrong_among, *right, *wrong])
     after = estimator.smoothed()
     assert [pair.current_ns - ROW_NS for pair in taken] == [pair.current_ns for pair in right]
     assert end_error(after, given.truth) < 0.3 * end_error(before, given.truth)
     error = given.truth.relative_pose(after[0].imu_ns, after[-1].imu_ns)[1] - after[0].R.T @ (
-        after[-1].position - after[0].position)
+        after[-1].position - after[0].position
+    )
     covariance = after[0].R.T @ after[-1].pose_covariance[:3, :3] @ after[0].R
-    assert error @ np.linalg.solve(covariance, error) < 14.2   # 3 sigma of three
+    assert error @ np.linalg.solve(covariance, error) < 14.2  # 3 sigma of three
     assert np.trace(covariance) < 0.2 * np.trace(before[-1].pose_covariance[:3, :3])
 
 
 def test_views_that_come_back_are_proposed():
     """Out and back along a line without turning; then the same with the camera turned round."""
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
-                                  distortion=(), readout_time=0.0)
+    camera = RollingShutterCamera(
+        width=640,
+        height=480,
+        fx=450.0,
+        fy=450.0,
+        cx=320.0,
+        cy=240.0,
+        distortion=(),
+        readout_time=0.0,
+    )
     facing = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
     def path_of(turned):
-        return [Odometry(at, at, 'camera', 0, 0, Rotation.from_euler(
-            'z', 180.0 if turned and k > 30 else 0.0, degrees=True).as_matrix() @ facing,
-            np.array([0.0, 4.0 - abs(k - 30) * 0.1, 1.5]), np.eye(6), NAN, NAN, np.eye(6))
-            for k in range(61) for at in [k * SECOND // 2]]
+        return [
+            Odometry(
+                at,
+                at,
+                'camera',
+                0,
+                0,
+                Rotation.from_euler(
+                    'z', 180.0 if turned and k > 30 else 0.0, degrees=True
+                ).as_matrix()
+                @ facing,
+                np.array([0.0, 4.0 - abs(k - 30) * 0.1, 1.5]),
+                np.eye(6),
+                NAN,
+                NAN,
+                np.eye(6),
+            )
+            for k in range(61)
+            for at in [k * SECOND // 2]
+        ]
 
     found = loops.proposed_loops(path_of(False), 5.0, camera)
-    assert len(found) == 30   # one per second
+    assert len(found) == 30  # one per second
     seconds = np.array(found) / 2.0
     assert (seconds[:, 1] - seconds[:, 0] >= 10.0).all()
     # The same places, k and 60 - k, come first, and no two loops are within a second.
@@ -99,17 +133,43 @@ def test_views_that_come_back_are_proposed():
 
 
 def test_depth_of_the_scene_is_that_of_parallaxes():
-    poses = [Odometry(k, k, 'camera', 0, 0, np.eye(3), np.array([0.1 * k, 0.0, 0.0]), np.eye(6),
-                      NAN, NAN, np.eye(6)) for k in range(4)]
+    poses = [
+        Odometry(
+            k,
+            k,
+            'camera',
+            0,
+            0,
+            np.eye(3),
+            np.array([0.1 * k, 0.0, 0.0]),
+            np.eye(6),
+            NAN,
+            NAN,
+            np.eye(6),
+        )
+        for k in range(4)
+    ]
     views = {k: loops.View(k, parallax) for k, parallax in enumerate((9.0, 9.0, 9.0, 0.1))}
     assert loops.scene_depth(poses, views, 450.0) == pytest.approx(5.0)
     assert math.isnan(loops.scene_depth(poses[:1], views, 450.0))
 
 
 def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(loops, '_APART', 2.0)   # the bag has 6 s
-    assert main(['odometry', str(bundled_bag), '--params', str(BUNDLED_PARAMETERS), '--out',
-                 str(tmp_path), '--loops']) == 0
+    monkeypatch.setattr(loops, '_APART', 2.0)  # the bag has 6 s
+    assert (
+        main(
+            [
+                'odometry',
+                str(bundled_bag),
+                '--params',
+                str(BUNDLED_PARAMETERS),
+                '--out',
+                str(tmp_path),
+                '--loops',
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'summary.json').read_text())
     found = summary['loops']
@@ -131,7 +191,7 @@ def test_metrics_of_a_closed_walk(monkeypatch):
     path = odometry_loops.closed(simulate(config).trajectory, 4.0)
     (begin, end), (R1, R2) = path.poses([0.0, 4.0])
     np.testing.assert_allclose(begin, end, atol=1e-9)
-    assert abs((R1.T @ R2)[2, 2] - 1.0) < 0.02   # the same view, but for nodding
+    assert abs((R1.T @ R2)[2, 2] - 1.0) < 0.02  # the same view, but for nodding
     metrics = odometry_loops.on_walk(config, path)
     assert metrics.offered >= metrics.related >= metrics.taken > 0
     assert metrics.worst < 1.0
@@ -140,16 +200,26 @@ def test_metrics_of_a_closed_walk(monkeypatch):
 
 # -- Disturbances of `benchmark odometry`: their tracks, and the states that follow ----------
 
+
 def test_states_through_a_disturbance():
     given = walk('walk:14', 14.0, imu_rate=100.0)
     # Gyro and accelerometer in messages of their own.
-    samples = [(sample.stamp_ns, part) for sample in given.samples for part in (
-        replace(sample, linear_acceleration=None), replace(sample, angular_velocity=None))]
+    samples = [
+        (sample.stamp_ns, part)
+        for sample in given.samples
+        for part in (
+            replace(sample, linear_acceleration=None),
+            replace(sample, angular_velocity=None),
+        )
+    ]
     R = Rotation.from_quat(given.quats).as_matrix()
     velocity = np.gradient(given.positions, (given.stamps - START_NS) * 1e-9, axis=0)
     feed = disturbances.Feed(
         PARAMETERS.updated({'max_coast': 10.0}).to_mapping(),
-        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)], samples, [])
+        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)],
+        samples,
+        [],
+    )
     truth = disturbances.TrueStates(given.stamps, given.positions, R, velocity)
     found = disturbances.on_feed('no images, 2 s', 1, feed, truth)
     # At 25 Hz, of an IMU with 100 Hz, and until the last sample.
@@ -169,19 +239,32 @@ def test_a_recording_in_parts(monkeypatch, tmp_path):
     """A path and its halves, of which the first one has no pairs in its last second."""
     given = walk('walk:9', 9.0, imu_rate=100.0)
     of_frames = trust_runs.simulated(
-        trust_runs.Source('walk', trust_runs.TRACKS), simulate(SimulationConfig(duration=0.2)),
-        trust_runs.TrackNoise(), np.random.default_rng(0))
+        trust_runs.Source('walk', trust_runs.TRACKS),
+        simulate(SimulationConfig(duration=0.2)),
+        trust_runs.TrackNoise(),
+        np.random.default_rng(0),
+    )
     recording = replace(
-        of_frames, samples=given.samples, arrivals=[
-            trust_runs.Arrival(k, ns, ns) for k, ns in enumerate(given.stamps[::5].tolist())])
+        of_frames,
+        samples=given.samples,
+        arrivals=[
+            trust_runs.Arrival(k, ns, ns) for k, ns in enumerate(given.stamps[::5].tolist())
+        ],
+    )
 
     def feed_of(part):
         first, last = part.arrivals[0].stamp_ns, part.arrivals[-1].stamp_ns
         is_first = last < START_NS + 6e9
         return disturbances.Feed(
-            PARAMETERS.to_mapping(), [(pair.current_ns, pair) for pair in given.pairs if (
-                first <= pair.reference_ns and pair.current_ns < last - is_first * 1e9)],
-            [(sample.stamp_ns, sample) for sample in part.samples], [])
+            PARAMETERS.to_mapping(),
+            [
+                (pair.current_ns, pair)
+                for pair in given.pairs
+                if (first <= pair.reference_ns and pair.current_ns < last - is_first * 1e9)
+            ],
+            [(sample.stamp_ns, sample) for sample in part.samples],
+            [],
+        )
 
     monkeypatch.setattr(odometry_recordings, 'recording_at', lambda path: recording)
     monkeypatch.setattr(disturbances, 'feed_of', feed_of)

@@ -23,23 +23,38 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 
 NAME = 'rs_relpose_ros'
 VERSION = '0.1.0'
-ROS = re.compile(r'(rclpy|rcl_interfaces|ament_\w+|builtin_interfaces|launch\w*|rosgraph_msgs'
-                 r'|tf2_ros|std_srvs|\w+_msgs)$')
+ROS = re.compile(
+    r'(rclpy|rcl_interfaces|ament_\w+|builtin_interfaces|launch\w*|rosgraph_msgs'
+    r'|tf2_ros|std_srvs|\w+_msgs)$'
+)
 LABORATORY = 'rs_relpose_lab'
-MODULES = {'.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
-           for package in (NAME, LABORATORY) for path in sorted((ROOT / package).rglob('*.py'))}
+MODULES = {
+    '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
+    for package in (NAME, LABORATORY)
+    for path in sorted((ROOT / package).rglob('*.py'))
+}
 
 
 def run(*command: str | Path, **kwargs) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(word) for word in command], stderr=subprocess.PIPE, text=True,
-                          timeout=100, check=False, **{'stdout': subprocess.PIPE, **kwargs})
+    return subprocess.run(
+        [str(word) for word in command],
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=100,
+        check=False,
+        **{'stdout': subprocess.PIPE, **kwargs},
+    )
 
 
 def loaded_after(code: str) -> set[str]:
     """Top-level names of the modules that a new interpreter has after `code`."""
-    ended = run(sys.executable, '-c', f'import sys\n{code}\n'
-                'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)',
-                cwd=ROOT)
+    ended = run(
+        sys.executable,
+        '-c',
+        f'import sys\n{code}\n'
+        'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)',
+        cwd=ROOT,
+    )
     assert ended.returncode == 0, ended.stderr
     return set(ended.stderr.splitlines()[-1].split())
 
@@ -80,8 +95,11 @@ def test_versions_agree(capsys):
     manifest = (ROOT / 'package.xml').read_text()
     assert re.search(r'<version>(.*?)</version>', manifest)[1] == VERSION
     assert re.search(r"version='(.*?)'", (ROOT / 'setup.py').read_text())[1] == VERSION
-    releases = re.findall(r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$',
-                          (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    releases = re.findall(
+        r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$',
+        (ROOT / 'CHANGELOG.rst').read_text(),
+        re.MULTILINE,
+    )
     assert releases[0] == VERSION
     assert distribution(NAME).version == VERSION
     assert command_line.main(['--version']) == 0
@@ -108,20 +126,29 @@ OPTIONAL = {'av', 'dask', 'distributed', 'gtsam', 'ncore', 'telemetry_parser'}
 
 
 def test_pip_and_rosdep_install_every_library_that_is_imported():
-    imported = {name.partition('.')[0] for path in MODULES.values() for name in imports(path)
-                if path.is_relative_to(ROOT / NAME)}
-    used = {name for name in imported - sys.stdlib_module_names - OPTIONAL - {NAME}
-            if not ROS.match(name)}
+    imported = {
+        name.partition('.')[0]
+        for path in MODULES.values()
+        for name in imports(path)
+        if path.is_relative_to(ROOT / NAME)
+    }
+    used = {
+        name
+        for name in imported - sys.stdlib_module_names - OPTIONAL - {NAME}
+        if not ROS.match(name)
+    }
     assert {'numpy', 'cv2', 'numba'} < used
-    pip, rosdep = zip(*(LIBRARIES.get(name, (name, f'python3-{name}')) for name in used),
-                      strict=True)
+    pip, rosdep = zip(
+        *(LIBRARIES.get(name, (name, f'python3-{name}')) for name in used), strict=True
+    )
     lines = (ROOT / 'requirements' / 'base.txt').read_text().lower().splitlines()
     listed = {re.match(r'[\w-]+', line)[0] for line in lines if not line.startswith(('#', 'ros-'))}
     assert set(pip) == listed - {'setuptools'}
     printing = (
         'import runpy, setuptools\n'
         'setuptools.setup = lambda **metadata: print(*metadata["install_requires"], sep="\\n")\n'
-        'runpy.run_path("setup.py")')
+        'runpy.run_path("setup.py")'
+    )
     ended = run(sys.executable, '-c', printing, cwd=ROOT)
     assert {re.match(r'[\w-]+', line)[0].lower() for line in ended.stdout.splitlines()} == listed
     manifest = (ROOT / 'package.xml').read_text()
@@ -129,8 +156,9 @@ def test_pip_and_rosdep_install_every_library_that_is_imported():
     assert set(rosdep) == keys
 
 
-@pytest.mark.parametrize('name', [
-    name for name, path in MODULES.items() if '>>> ' in path.read_text()])
+@pytest.mark.parametrize(
+    'name', [name for name, path in MODULES.items() if '>>> ' in path.read_text()]
+)
 def test_examples_in_docstrings_are_true(name):
     failed, attempted = doctest.testmod(importlib.import_module(name))
     assert failed == 0 < attempted
@@ -171,8 +199,16 @@ MAY_IMPORT_IN_THE_LABORATORY = {
     'experiments': {'simulation', 'live'},
     'cli': {'simulation', 'live', 'experiments'},
 }
-FREE_OF_ROS = ('geometry', 'config', 'solvers', 'estimator', 'imu', 'tracking', 'pipeline',
-               'messages')
+FREE_OF_ROS = (
+    'geometry',
+    'config',
+    'solvers',
+    'estimator',
+    'imu',
+    'tracking',
+    'pipeline',
+    'messages',
+)
 
 
 def room_of(module: str) -> tuple[str, str]:
@@ -201,10 +237,13 @@ def test_folders_import_what_their_layer_may():
 
 
 def test_no_private_name_crosses_a_folder():
-    assert [f'{name} imports {imported}'
-            for name, path in MODULES.items() for imported in imports(path)
-            if re.match(rf'({NAME}|{LABORATORY})\..*\b_(?!_)', imported)
-            and room_of(module_behind(imported)) != room_of(name)] == []
+    assert [
+        f'{name} imports {imported}'
+        for name, path in MODULES.items()
+        for imported in imports(path)
+        if re.match(rf'({NAME}|{LABORATORY})\..*\b_(?!_)', imported)
+        and room_of(module_behind(imported)) != room_of(name)
+    ] == []
 
 
 def test_core_imports_neither_ros_nor_rosbags():
@@ -213,13 +252,20 @@ def test_core_imports_neither_ros_nor_rosbags():
     assert {name for name in loaded if ROS.match(name) or name == 'rosbags'} == set()
 
 
-@pytest.mark.parametrize(('library', 'folders'), [
-    (ROS, {f'{NAME}/nodes', f'{LABORATORY}/live'}),
-    (re.compile('gtsam$'), {f'{NAME}/odometry'}),
-    (re.compile('rosbags$'), {f'{NAME}/bags'})])
+@pytest.mark.parametrize(
+    ('library', 'folders'),
+    [
+        (ROS, {f'{NAME}/nodes', f'{LABORATORY}/live'}),
+        (re.compile('gtsam$'), {f'{NAME}/odometry'}),
+        (re.compile('rosbags$'), {f'{NAME}/bags'}),
+    ],
+)
 def test_library_is_imported_in_its_folders_only(library, folders):
-    users = {path for path in MODULES.values()
-             if any(library.match(name.partition('.')[0]) for name in imports(path))}
+    users = {
+        path
+        for path in MODULES.values()
+        if any(library.match(name.partition('.')[0]) for name in imports(path))
+    }
     assert users, f'nothing imports {library.pattern}: the test would see nothing'
     assert {str(path.parent.relative_to(ROOT)) for path in users} <= folders
 
@@ -231,27 +277,36 @@ def test_gtsam_is_imported_where_odometry_runs_only():
 
 
 def test_modules_import_each_other_without_cycles():
-    graph = {name: {module_behind(imported) for imported in imports(path)} - {name, ''}
-             for name, path in MODULES.items()}
+    graph = {
+        name: {module_behind(imported) for imported in imports(path)} - {name, ''}
+        for name, path in MODULES.items()
+    }
     assert len(graph) > 10
     graphlib.TopologicalSorter(graph).prepare()  # CycleError names the cycle
 
 
 def test_the_library_does_not_print_or_exit():
     """Only the command line and the node's main do (what ruff's T20 cannot see: sys.exit)."""
-    exits = [f'{path.relative_to(ROOT)}:{node.lineno}'
-             for path in MODULES.values() if path.parent.name not in ('cli', 'nodes', 'live')
-             for node in ast.walk(ast.parse(path.read_text()))
-             if isinstance(node, ast.Call)
-             and ast.unparse(node.func) in ('sys.exit', 'exit', 'quit', 'os._exit', 'print')]
+    exits = [
+        f'{path.relative_to(ROOT)}:{node.lineno}'
+        for path in MODULES.values()
+        if path.parent.name not in ('cli', 'nodes', 'live')
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func) in ('sys.exit', 'exit', 'quit', 'os._exit', 'print')
+    ]
     assert exits == []
 
 
-@pytest.mark.parametrize('script', [
-    'relpose_node', 'global_shutter_node', 'odometry_node', 'rs_relpose'])
+@pytest.mark.parametrize(
+    'script', ['relpose_node', 'global_shutter_node', 'odometry_node', 'rs_relpose']
+)
 def test_console_script_resolves(script):
-    entries = {entry.name: entry for entry in distribution(NAME).entry_points
-               if entry.group == 'console_scripts'}
+    entries = {
+        entry.name: entry
+        for entry in distribution(NAME).entry_points
+        if entry.group == 'console_scripts'
+    }
     assert callable(entries[script].load())
 
 
@@ -265,8 +320,9 @@ def test_command_describes_itself(name, capsys, monkeypatch):
 
 
 def test_overview_names_every_command_and_imports_none():
-    ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help',
-                env={**os.environ, 'COLUMNS': '400'})
+    ended = run(
+        sys.executable, '-m', f'{NAME}.cli.main', '--help', env={**os.environ, 'COLUMNS': '400'}
+    )
     assert ended.returncode == 0
     for name, (_, one_line) in command_line.COMMANDS.items():
         assert re.search(rf'{name}\s+{one_line}', ' '.join(ended.stdout.split()))
@@ -285,33 +341,54 @@ def test_bad_usage(arguments, capsys):
 @pytest.fixture
 def as_replay(monkeypatch):
     """Makes a function the work of the command."""
+
     def install(work):
-        command = SimpleNamespace(HELP='stand in', run=work, add_arguments=(
-            lambda parser: parser.add_argument('number', type=int)))
+        command = SimpleNamespace(
+            HELP='stand in',
+            run=work,
+            add_arguments=(lambda parser: parser.add_argument('number', type=int)),
+        )
         monkeypatch.setattr(command_line, 'load_command', lambda name: command)
+
     return install
 
 
-@pytest.mark.parametrize(('words', 'code'), [
-    (['replay', '0'], 0), (['replay', '3'], 3),
-    (['-v', 'replay', '3'], 13), (['replay', '-v', '3'], 13)])
+@pytest.mark.parametrize(
+    ('words', 'code'),
+    [
+        (['replay', '0'], 0),
+        (['replay', '3'], 3),
+        (['-v', 'replay', '3'], 13),
+        (['replay', '-v', '3'], 13),
+    ],
+)
 def test_command_gets_its_arguments_and_gives_the_exit_code(words, code, as_replay):
     as_replay(lambda args: args.number + 10 * args.verbose)
     assert command_line.main(words) == code
 
 
-@pytest.mark.parametrize(('error', 'code', 'line'), [
-    (InputError('the bag\nends early'), 2, 'rs_relpose: error: the bag ends early\n'),
-    (MissingInputError('no topic'), 2, 'rs_relpose: error: no topic\n'),
-    (FileNotFoundError(2, 'No such file or directory', 'x.bag'), 2,
-     'rs_relpose: error: x.bag: No such file or directory\n'),
-    (OSError(28, 'No space left on device'), 1,
-     'rs_relpose: error: [Errno 28] No space left on device\n'),
-    (KeyboardInterrupt(), 130, 'rs_relpose: interrupted\n'),
-])
+@pytest.mark.parametrize(
+    ('error', 'code', 'line'),
+    [
+        (InputError('the bag\nends early'), 2, 'rs_relpose: error: the bag ends early\n'),
+        (MissingInputError('no topic'), 2, 'rs_relpose: error: no topic\n'),
+        (
+            FileNotFoundError(2, 'No such file or directory', 'x.bag'),
+            2,
+            'rs_relpose: error: x.bag: No such file or directory\n',
+        ),
+        (
+            OSError(28, 'No space left on device'),
+            1,
+            'rs_relpose: error: [Errno 28] No space left on device\n',
+        ),
+        (KeyboardInterrupt(), 130, 'rs_relpose: interrupted\n'),
+    ],
+)
 def test_error_is_one_line_and_an_exit_code(error, code, line, as_replay, capsys):
     def work(args):
         raise error
+
     as_replay(work)
     assert command_line.main(['replay', '1']) == code
     assert capsys.readouterr().err == line
@@ -329,8 +406,9 @@ def test_closed_pipe_is_quiet():
     # Unbuffered, argparse itself would swallow the error.
     environment = {key: value for key, value in os.environ.items() if key != 'PYTHONUNBUFFERED'}
     with os.fdopen(writer, 'w') as pipe:
-        ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help', stdout=pipe,
-                    env=environment)
+        ended = run(
+            sys.executable, '-m', f'{NAME}.cli.main', '--help', stdout=pipe, env=environment
+        )
     assert ended.returncode == command_line.PIPE_CLOSED
     assert ended.stderr == ''
 
@@ -367,8 +445,9 @@ KERNELS = Path(NAME) / '__pycache__' / 'kernels'
 def tracked_files() -> list[Path]:
     if not (ROOT / '.git').exists() or shutil.which('git') is None:
         pytest.skip('no git checkout: the tracked files are unknown')
-    listed = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True,
-                            check=True).stdout
+    listed = subprocess.run(
+        ['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     return [Path(name) for name in listed.split('\0') if name and (ROOT / name).is_file()]
 
 
@@ -389,8 +468,14 @@ def install_space(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if (ROOT / KERNELS).is_dir():
         shutil.copytree(ROOT / KERNELS, workspace / 'build' / NAME / 'build' / 'lib' / KERNELS)
     built = subprocess.run(
-        [colcon, 'build', '--event-handlers', 'console_direct+'], cwd=workspace,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=110, check=False)
+        [colcon, 'build', '--event-handlers', 'console_direct+'],
+        cwd=workspace,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=110,
+        check=False,
+    )
     assert built.returncode == 0, built.stdout
     # A manifest that colcon finds invalid makes the folder a plain Python package, without a word.
     assert (workspace / 'install' / NAME / 'share' / NAME / 'package.dsv').is_file(), built.stdout
@@ -411,14 +496,25 @@ print(sum(len(stat.cache_hits) for stat in stats), sum(len(stat.cache_misses) fo
 
 def in_install_space(install_space: Path, *command: str) -> list[str]:
     """Return the command line that runs `command` after sourcing the install space."""
-    return ['bash', '-c', 'source "$0/local_setup.bash" && exec "$@"', str(install_space),
-            *command]
+    return [
+        'bash',
+        '-c',
+        'source "$0/local_setup.bash" && exec "$@"',
+        str(install_space),
+        *command,
+    ]
 
 
 def printed(install_space: Path, *command: str) -> str:
     """Output of a command in the install space, which must succeed."""
-    ended = subprocess.run(in_install_space(install_space, *command), cwd=install_space,
-                           capture_output=True, text=True, timeout=100, check=False)
+    ended = subprocess.run(
+        in_install_space(install_space, *command),
+        cwd=install_space,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
     assert ended.returncode == 0, ended.stderr
     return ended.stdout.strip()
 
@@ -433,16 +529,26 @@ def test_everything_is_installed_and_found(install_space):
     assert (share / 'ament_index' / 'resource_index' / 'packages' / NAME).is_file()
     assert (share / NAME / 'package.xml').is_file()
     located = printed(
-        install_space, sys.executable, '-c', f'import {NAME}; print({NAME}.__path__[0]);'
+        install_space,
+        sys.executable,
+        '-c',
+        f'import {NAME}; print({NAME}.__path__[0]);'
         'from ament_index_python import get_package_share_directory as share;'
-        f'print(share("{NAME}"))')
+        f'print(share("{NAME}"))',
+    )
     library, found = map(Path, located.splitlines())
     assert found == share / NAME
     assert library.is_relative_to(install_space)
-    missing = [str(name) for name in tracked_files()
-               if (name.parts[0] == NAME and not (library.parent / name).is_file())
-               or (name.parts[0] in ('config', 'launch') and not name.name.startswith('.')
-                   and not (share / NAME / name).is_file())]
+    missing = [
+        str(name)
+        for name in tracked_files()
+        if (name.parts[0] == NAME and not (library.parent / name).is_file())
+        or (
+            name.parts[0] in ('config', 'launch')
+            and not name.name.startswith('.')
+            and not (share / NAME / name).is_file()
+        )
+    ]
     assert missing == []
 
 
@@ -458,10 +564,20 @@ def test_node_starts_and_stops(install_space, ros_domain_id):
 
     from rs_relpose_lab.live.graph import Graph
     from rs_relpose_lab.live.processes import Process, wait_until
-    command = in_install_space(install_space, executable(install_space, 'relpose_node'),
-                               '--ros-args', '-r', '__node:=installed', '-p', 'readout_time:=0.03')
-    with Graph() as graph, Process(
-            '-c', 'import os, sys; os.execvp("bash", sys.argv[1:])', *command) as node:
+
+    command = in_install_space(
+        install_space,
+        executable(install_space, 'relpose_node'),
+        '--ros-args',
+        '-r',
+        '__node:=installed',
+        '-p',
+        'readout_time:=0.03',
+    )
+    with (
+        Graph() as graph,
+        Process('-c', 'import os, sys; os.execvp("bash", sys.argv[1:])', *command) as node,
+    ):
         received = graph.listen(DiagnosticArray, '/diagnostics')
         wait_until(lambda: received, 'diagnostics', node)
         assert received[0].status[0].name.startswith('/installed: ')

@@ -26,8 +26,10 @@ from rs_relpose_ros.pipeline.pair import Frame
 
 START_NS = 1_700_000_000_000_000_000
 HEAD = 'reference_stamp_ns,stamp_ns\n'
-COLUMNS = ('reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'
-           'sigma_rz,inliers,matches,model,status,baseline_m,baseline_log_sigma,reason')
+COLUMNS = (
+    'reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'
+    'sigma_rz,inliers,matches,model,status,baseline_m,baseline_log_sigma,reason'
+)
 
 
 def stamp_of(frame: int, fps: float = 30.0) -> int:
@@ -36,12 +38,20 @@ def stamp_of(frame: int, fps: float = 30.0) -> int:
 
 
 def pairs_command(bag: Path, listed: Path, out: Path, *options: object) -> list[str]:
-    return ['pairs', str(bag), '--list', str(listed), '--out', str(out),
-            *map(str, options or ('--params', BUNDLED_PARAMETERS))]
+    return [
+        'pairs',
+        str(bag),
+        '--list',
+        str(listed),
+        '--out',
+        str(out),
+        *map(str, options or ('--params', BUNDLED_PARAMETERS)),
+    ]
 
 
-def run_pairs(bag: Path, parameters: Path, pairs: list[tuple[int, int]], folder: Path,
-              *options: str) -> tuple[int, list[dict[str, str]]]:
+def run_pairs(
+    bag: Path, parameters: Path, pairs: list[tuple[int, int]], folder: Path, *options: str
+) -> tuple[int, list[dict[str, str]]]:
     folder.mkdir(exist_ok=True)
     listed = folder / 'pairs.csv'
     listed.write_text(HEAD + ''.join(f'{first},{second}\n' for first, second in pairs))
@@ -59,10 +69,12 @@ def assert_within_covariance(rows: list[dict[str, str]], errors: list[dict[str, 
 
 # From 0.3 to 3.6 s apart, with parallax; not in the order of time.
 GOOD = [(45, 81), (0, 9), (0, 48), (9, 75), (115, 157), (0, 69)]
-BAD = {(stamp_of(9), stamp_of(0)): 'reference_stamp_ns must be before stamp_ns: exchange them',
-       (stamp_of(9), stamp_of(9)): 'give two different images',
-       (5, stamp_of(9)): 'has the stamp 5',
-       (stamp_of(9), stamp_of(9) + 1): f'has the stamp {stamp_of(9) + 1}'}
+BAD = {
+    (stamp_of(9), stamp_of(0)): 'reference_stamp_ns must be before stamp_ns: exchange them',
+    (stamp_of(9), stamp_of(9)): 'give two different images',
+    (5, stamp_of(9)): 'has the stamp 5',
+    (stamp_of(9), stamp_of(9) + 1): f'has the stamp {stamp_of(9) + 1}',
+}
 
 
 @pytest.fixture(scope='module')
@@ -80,14 +92,15 @@ def test_every_row_of_the_list_has_one_in_its_order(bundled):
     assert (folder / 'out' / 'relative_poses.csv').read_text().splitlines()[0] == COLUMNS
     listed = rows_of(folder / 'pairs.csv')
     assert [(row['reference_stamp_ns'], row['stamp_ns']) for row in rows] == [
-        (row['reference_stamp_ns'], row['stamp_ns']) for row in listed]
+        (row['reference_stamp_ns'], row['stamp_ns']) for row in listed
+    ]
     # Independently of the rest of the list.
-    assert rows[:len(GOOD)] == rows[-len(GOOD):]
+    assert rows[: len(GOOD)] == rows[-len(GOOD) :]
 
 
 def test_wide_pairs_agree_with_the_truth(bundled):
     """Baselines of 0.6 to 4.2 m, over which no corner is followed."""
-    rows, errors = (table[:len(GOOD)] for table in bundled[1:3])
+    rows, errors = (table[: len(GOOD)] for table in bundled[1:3])
     assert {(row['status'], row['reason']) for row in rows} == {('OK', '')}
     for name, median, largest in (('rotation', 0.1, 0.2), ('translation', 0.4, 1.0)):
         found = [float(row[f'{name}_error_deg']) for row in errors]
@@ -98,30 +111,46 @@ def test_wide_pairs_agree_with_the_truth(bundled):
 
 def test_rows_that_cannot_be_estimated_have_the_reason(bundled):
     _, rows, _, _ = bundled
-    for row in rows[len(GOOD):-len(GOOD)]:
+    for row in rows[len(GOOD) : -len(GOOD)]:
         assert row['status'] == 'BAD_INPUT'
         assert BAD[int(row['reference_stamp_ns']), int(row['stamp_ns'])] in row['reason']
         assert row['tx'] == row['inliers'] == ''
 
 
-@pytest.mark.parametrize(('last', 'setting', 'status', 'reason'), [
-    # The last frame's gyro lies behind the end of the bag.
-    (179, 'time_offset=0.2', 'BAD_INPUT', 'the gyro ends before the last row'),
-    (9, 'max_descriptors=8', 'TOO_FEW_MATCHES', 'usable matches')])
+@pytest.mark.parametrize(
+    ('last', 'setting', 'status', 'reason'),
+    [
+        # The last frame's gyro lies behind the end of the bag.
+        (179, 'time_offset=0.2', 'BAD_INPUT', 'the gyro ends before the last row'),
+        (9, 'max_descriptors=8', 'TOO_FEW_MATCHES', 'usable matches'),
+    ],
+)
 def test_pair_without_gyro_or_matches(bundled_bag, tmp_path, last, setting, status, reason):
-    code, [row] = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [(stamp_of(0), stamp_of(last))],
-                            tmp_path, '--set', setting)
+    code, [row] = run_pairs(
+        bundled_bag,
+        BUNDLED_PARAMETERS,
+        [(stamp_of(0), stamp_of(last))],
+        tmp_path,
+        '--set',
+        setting,
+    )
     assert (code, row['status']) == (1, status)
     assert reason in row['reason']
 
 
-@pytest.mark.parametrize(('text', 'words'), [
-    ('', 'has no pairs below a line with the column names reference_stamp_ns and stamp_ns'),
-    ('1,2\n3,4\n', 'line 2: it has no column reference_stamp_ns'),
-    (HEAD, 'has no pairs'),
-    (f'{HEAD}1, 2\n1.7e18,3\n',
-     'line 3: column reference_stamp_ns must be a stamp in nanoseconds, an integer'),
-    (f'{HEAD}1\n', 'line 2: column stamp_ns must be')])
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('', 'has no pairs below a line with the column names reference_stamp_ns and stamp_ns'),
+        ('1,2\n3,4\n', 'line 2: it has no column reference_stamp_ns'),
+        (HEAD, 'has no pairs'),
+        (
+            f'{HEAD}1, 2\n1.7e18,3\n',
+            'line 3: column reference_stamp_ns must be a stamp in nanoseconds, an integer',
+        ),
+        (f'{HEAD}1\n', 'line 2: column stamp_ns must be'),
+    ],
+)
 def test_list_that_is_none(text, words, bundled_bag, tmp_path, refused):
     listed = tmp_path / 'pairs.csv'
     listed.write_text(text)
@@ -130,7 +159,8 @@ def test_list_that_is_none(text, words, bundled_bag, tmp_path, refused):
 
 
 def test_results_replace_those_of_an_earlier_run_but_not_the_list(
-        bundled_bag, tmp_path, refused, monkeypatch):
+    bundled_bag, tmp_path, refused, monkeypatch
+):
     def refuse(_: object, role: Role, message: object) -> InputError | None:
         return InputError('not calibrated') if role is Role.CAMERA_INFO else None
 
@@ -148,7 +178,7 @@ def test_results_replace_those_of_an_earlier_run_but_not_the_list(
 
 FPS, SECONDS = 5.0, 6.0
 LAST = round(FPS * SECONDS) - 1
-CLOSE = 4   # frames from the first one, 0.8 s
+CLOSE = 4  # frames from the first one, 0.8 s
 
 
 def loop() -> Trajectory:
@@ -157,12 +187,20 @@ def loop() -> Trajectory:
     times = np.arange(-1.0, SECONDS + 1.0, spacing)
     phase = np.clip(times / (LAST / FPS), 0.0, 1.0)
     turn = 2.0 * np.pi * phase
-    positions = np.column_stack([
-        0.6 * (1.0 - np.cos(turn)) - 0.6 + 0.05 * phase, 0.5 * np.sin(turn) + 0.3 * phase,
-        1.6 + 0.04 * np.sin(11.0 * times)])
-    angles = np.column_stack([
-        0.5 * np.sin(turn) + math.radians(10.0) * phase + 0.02 * np.sin(7.0 * times),
-        0.05 * np.sin(5.0 * times), 0.04 * np.sin(3.0 * times)])
+    positions = np.column_stack(
+        [
+            0.6 * (1.0 - np.cos(turn)) - 0.6 + 0.05 * phase,
+            0.5 * np.sin(turn) + 0.3 * phase,
+            1.6 + 0.04 * np.sin(11.0 * times),
+        ]
+    )
+    angles = np.column_stack(
+        [
+            0.5 * np.sin(turn) + math.radians(10.0) * phase + 0.02 * np.sin(7.0 * times),
+            0.05 * np.sin(5.0 * times),
+            0.04 * np.sin(3.0 * times),
+        ]
+    )
     return Trajectory(positions, angles, float(times[0]), spacing)
 
 
@@ -177,8 +215,9 @@ def returned(tmp_path_factory):
 def test_loop_is_closed(returned, tmp_path):
     """Start and end of the walk, 5.8 s apart: the gyro between them is not in the history."""
     bag, parameters, _ = returned
-    pairs = [(stamp_of(a, FPS), stamp_of(b, FPS)) for a, b in [(0, LAST), (1, LAST - 1),
-                                                               (2, LAST)]]
+    pairs = [
+        (stamp_of(a, FPS), stamp_of(b, FPS)) for a, b in [(0, LAST), (1, LAST - 1), (2, LAST)]
+    ]
     code, rows = run_pairs(bag, parameters, pairs, tmp_path)
     assert code == 0
     assert [row['status'] for row in rows] == ['OK'] * len(pairs)
@@ -197,11 +236,14 @@ def library(returned):
     camera, series = simulation.camera, simulation.imu
     parameters = read_parameters(parameter_file, ['imu_buffer_seconds=60'])
     imu = ImuBuffer(parameters.imu)
-    for stamp, rate, force in zip(series.stamps_ns, series.angular_velocities,
-                                  series.linear_accelerations, strict=True):
+    for stamp, rate, force in zip(
+        series.stamps_ns, series.angular_velocities, series.linear_accelerations, strict=True
+    ):
         imu.add(ImuSample(int(stamp), tuple(rate), tuple(force)))
-    frames = [Frame(simulation.stamp_ns(k), simulation.image(k), 'camera', intrinsics_of(camera))
-              for k in (0, LAST)]
+    frames = [
+        Frame(simulation.stamp_ns(k), simulation.image(k), 'camera', intrinsics_of(camera))
+        for k in (0, LAST)
+    ]
     return parameters, imu, frames
 
 
@@ -225,8 +267,12 @@ def test_frames_between_close_ones_are_used(library, returned):
     parameters, imu, _ = library
     parameters = parameters.updated({'max_keyframe_interval': 1.0})
     simulation, views, done = returned[2], [], {}
-    frames = [Frame(simulation.stamp_ns(k), simulation.image(k), 'camera',
-                    intrinsics_of(simulation.camera)) for k in range(CLOSE + 1)]
+    frames = [
+        Frame(
+            simulation.stamp_ns(k), simulation.image(k), 'camera', intrinsics_of(simulation.camera)
+        )
+        for k in range(CLOSE + 1)
+    ]
     ends = frames[0].stamp_ns, frames[-1].stamp_ns
     pairs = ChosenPairs([ends])
     for frame in frames:
@@ -284,13 +330,24 @@ def test_example(bundled_bag, bundled):
     _, rows, _, _ = bundled
     row = rows[3]
     ended = subprocess.run(
-        [sys.executable, ROOT / 'docs' / 'examples' / 'loop_closure.py', bundled_bag,
-         BUNDLED_PARAMETERS, row['reference_stamp_ns'], row['stamp_ns']],
-        capture_output=True, text=True, timeout=140, check=False)
+        [
+            sys.executable,
+            ROOT / 'docs' / 'examples' / 'loop_closure.py',
+            bundled_bag,
+            BUNDLED_PARAMETERS,
+            row['reference_stamp_ns'],
+            row['stamp_ns'],
+        ],
+        capture_output=True,
+        text=True,
+        timeout=140,
+        check=False,
+    )
     assert ended.returncode == 0, ended.stderr
     printed = np.array([line.split() for line in ended.stdout.splitlines()], dtype=float)
     R = Rotation.from_quat([float(row[f'q{axis}']) for axis in 'xyzw']).as_matrix()
     # Its history of the gyro reaches over both frames, that of the command line does not.
     np.testing.assert_allclose(printed[:, :3], R, atol=2e-3)
-    np.testing.assert_allclose(printed[:, 3], [float(row[f't{axis}']) for axis in 'xyz'],
-                               atol=1e-2)
+    np.testing.assert_allclose(
+        printed[:, 3], [float(row[f't{axis}']) for axis in 'xyz'], atol=1e-2
+    )

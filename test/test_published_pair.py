@@ -39,9 +39,14 @@ def rotation_only(result: PairResult, status: Status = Status.PURE_ROTATION) -> 
 
 
 def without_rotation(result: PairResult) -> PairResult:
-    return replace(result, pose=RelativePose(
-        status=Status.NO_CONSENSUS, reason='nothing agrees',
-        inliers=np.zeros(len(result.matches), dtype=bool)))
+    return replace(
+        result,
+        pose=RelativePose(
+            status=Status.NO_CONSENSUS,
+            reason='nothing agrees',
+            inliers=np.zeros(len(result.matches), dtype=bool),
+        ),
+    )
 
 
 def completed(synchronizer: PairSynchronizer, messages: dict[str, Any]) -> list[bool]:
@@ -65,40 +70,65 @@ def test_the_table_of_a_live_run_is_that_of_the_replay(results, tmp_path):
     for row, result in zip(rows, results, strict=True):
         assert (row['stamp_ns'], row['status']) == (str(result.stamp_ns), 'OK')
         assert float(row['tx']) == result.pose.t[0]
-        assert row['baseline_m'] == ('' if np.isnan(result.pose.baseline)
-                                     else repr(result.pose.baseline))
+        assert row['baseline_m'] == (
+            '' if np.isnan(result.pose.baseline) else repr(result.pose.baseline)
+        )
 
 
 def with_images(result: PairResult) -> PairResult:
     rng, pose = np.random.default_rng(0), result.pose
     root = rng.normal(size=(11, 11))
-    return replace(result, pose=replace(pose, images=ImageInformation(
-        0.015, pose.R, pose.t, rng.normal(size=6), root.T @ root, rng.normal(size=11))))
+    return replace(
+        result,
+        pose=replace(
+            pose,
+            images=ImageInformation(
+                0.015, pose.R, pose.t, rng.normal(size=6), root.T @ root, rng.normal(size=11)
+            ),
+        ),
+    )
 
 
 @build.both_types
-@pytest.mark.parametrize('kind', [
-    lambda result: result, with_images, lambda result: rotation_only(with_images(result)),
-    lambda result: rotation_only(result, Status.LOW_PARALLAX), without_rotation])
+@pytest.mark.parametrize(
+    'kind',
+    [
+        lambda result: result,
+        with_images,
+        lambda result: rotation_only(with_images(result)),
+        lambda result: rotation_only(result, Status.LOW_PARALLAX),
+        without_rotation,
+    ],
+)
 def test_what_was_published_is_read_back(results, types, kind):
     """Unknown values are NaN in the same places."""
-    result = kind(replace(
-        results[0], gyro_bias=np.array([0.1, -2e-3, 1e-17]),
-        pose=replace(results[0].pose, baseline=0.25, baseline_log_sigma=0.1)))
+    result = kind(
+        replace(
+            results[0],
+            gyro_bias=np.array([0.1, -2e-3, 1e-17]),
+            pose=replace(results[0].pose, baseline=0.25, baseline_log_sigma=0.1),
+        )
+    )
     pair, pose = published_pair(build.pair_messages(result, types)), result.pose
     assert (bool(pair), pair.rotation_known) == (bool(pose), pose.rotation_known)
     assert (pair.status, pair.reason, pair.frame_id) == (pose.status.value, pose.reason, 'camera')
-    assert (pair.reference_stamp_ns, pair.stamp_ns, pair.reference_imu_ns,
-            pair.current_imu_ns) == (result.reference_stamp_ns, result.stamp_ns,
-                                     result.reference_ns1, result.reference_ns2)
+    assert (
+        pair.reference_stamp_ns,
+        pair.stamp_ns,
+        pair.reference_imu_ns,
+        pair.current_imu_ns,
+    ) == (result.reference_stamp_ns, result.stamp_ns, result.reference_ns1, result.reference_ns2)
     np.testing.assert_allclose(pair.R, pose.R, atol=1e-15)
     for name in ('covariance', 'velocity_covariance'):
         np.testing.assert_allclose(getattr(pair, name), getattr(pose, name), rtol=1e-9, atol=1e-18)
     for found, expected in (
-            (pair.t, pose.t), (pair.linear_velocity, pose.linear_velocity2),
-            (pair.angular_velocity, pose.angular_velocity2), (pair.gyro_bias, result.gyro_bias),
-            ((pair.baseline, pair.baseline_log_sigma), (pose.baseline, pose.baseline_log_sigma)),
-            (pair.matches, inlier_records(result) if pair else np.empty(0, MATCH_DTYPE))):
+        (pair.t, pose.t),
+        (pair.linear_velocity, pose.linear_velocity2),
+        (pair.angular_velocity, pose.angular_velocity2),
+        (pair.gyro_bias, result.gyro_bias),
+        ((pair.baseline, pair.baseline_log_sigma), (pose.baseline, pose.baseline_log_sigma)),
+        (pair.matches, inlier_records(result) if pair else np.empty(0, MATCH_DTYPE)),
+    ):
         np.testing.assert_array_equal(found, expected)
     assert (pair.images is None) == (pose.images is None)
     if pair.images is not None:
@@ -107,13 +137,14 @@ def test_what_was_published_is_read_back(results, types, kind):
             np.testing.assert_array_equal(getattr(pair.images, name), getattr(pose.images, name))
 
 
-@pytest.mark.parametrize(('kind', 'count'), [
-    (lambda result: result, 6), (rotation_only, 2), (without_rotation, 1)])
+@pytest.mark.parametrize(
+    ('kind', 'count'), [(lambda result: result, 6), (rotation_only, 2), (without_rotation, 1)]
+)
 def test_messages_come_in_any_order(results, kind, count):
     messages = build.pair_messages(kind(results[0]), build.rosbags_types)
     synchronizer = PairSynchronizer()
     for *first, last in itertools.permutations(messages.items(), count):
-        for item in first * 2:   # what comes again replaces the first
+        for item in first * 2:  # what comes again replaces the first
             assert synchronizer.add(*item) is None
         assert synchronizer.add(*last) is not None
     assert len(messages) == count
@@ -127,7 +158,8 @@ def test_a_topic_may_run_ahead(pairs, results):
         assert [synchronizer.add(topic, pair[topic]) for pair in pairs] == [None] * 4
     found = [synchronizer.add('velocity', pair['velocity']) for pair in reversed(pairs)]
     assert [pair and pair.stamp_ns for pair in found] == [
-        result.stamp_ns for result in reversed(results)]
+        result.stamp_ns for result in reversed(results)
+    ]
     assert synchronizer.given_up == 0
 
 
@@ -149,8 +181,9 @@ def test_incomplete_pairs_do_not_accumulate(pairs):
 
 
 def set_data(cloud: Any, data: bytes) -> None:
-    cloud.data = array('B', data) if isinstance(cloud.data, array) else np.frombuffer(
-        data, np.uint8)
+    cloud.data = (
+        array('B', data) if isinstance(cloud.data, array) else np.frombuffer(data, np.uint8)
+    )
 
 
 def test_no_match_is_an_array_of_none(pairs):
@@ -177,43 +210,70 @@ def changed_records(name: str, change: Callable[[np.ndarray], object]) -> Callab
         records = np.frombuffer(bytes(cloud.data), MATCH_DTYPE).copy()
         change(records[name])
         return records.tobytes()
+
     return data
 
 
-@pytest.mark.parametrize(('topic', 'path', 'value', 'expected'), [
-    *(('matches', *row) for row in (
-        ('fields.3.name', 'intensity', 'must have the fields u1 v1 .* got u1 v1 u2 intensity'),
-        ('fields.0.name', 'v1', 'got v1 v1'),
-        ('fields.1.datatype', 8, 'must have the fields'),
-        ('fields', [], 'got none'), ('is_bigendian', True, 'got .* big endian'),
-        ('point_step', 0, ' 0 bytes$'),
-        ('width', 2**32 - 1, 'has 2400 bytes of data, but 4294967295x1 points need'),
-        ('data', lambda cloud: bytes(cloud.data)[:-1],
-         'has 2399 bytes of data, but 30x1 points need 2400'),
-        ('data', changed_records('tau2', lambda column: column.put(5, np.inf)),
-         '~/matches must be finite'),
-        ('data', changed_records('z2', lambda column: np.add(column, 1.0, out=column)),
-         'the rays x2 y2 z2 of ~/matches must have length 1'))),
-    ('relative_pose', 'pose.pose.position.x', float('nan'), 'position .* length 1'),
-    ('relative_pose', 'pose.pose.orientation.w', float('nan'), 'orientation .* length 1'),
-    ('velocity', 'twist.twist.linear.z', float('nan'), 'linear velocity .* must be finite'),
-    ('velocity', 'twist.twist.angular.z', float('inf'), 'angular velocity .* must be finite'),
-    ('velocity', 'twist.covariance.7', float('nan'), 'covariance of ~/velocity must '),
-    ('reference', 'time_ref.nanosec', 10**9, 'stamp is out of range'),
-    ('reference', 'time_ref.sec', 5, 'must name the same reference keyframe'),
-    ('matches', 'header.stamp.sec', 5, 'same stamp'),
-    ('velocity', 'header.stamp.sec', -1, 'stamp is out of range'),
-    ('pairs', 'status', [], 'must have one status, got 0'),
-    ('pairs', 'status.0.values', [], 'must have the key topics'),
-    ('pairs', 'status.0.values.0.key', 'other', 'must have the key reference_stamp_ns'),
-    ('pairs', 'status.0.values.0.value', '-5', 'reference_stamp_ns .* a timestamp'),
-    ('pairs', 'status.0.values.-4.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
-    ('pairs', 'status.0.values.-4.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
-    ('pairs', 'status.0.values.-6.value', '0.1 0.2', 'image_information .* unknowns'),
-    ('pairs', 'status.0.values.-6.value', '0.1 0.2 inf', 'image_gradient .* finite'),
-    ('pairs', 'status.0.values.-1.value', 'matches', 'must name all others'),
-    ('pairs', 'status.0.values.-1.value', 'relative_rotation', 'lists pairs relative_rotation'),
-])
+@pytest.mark.parametrize(
+    ('topic', 'path', 'value', 'expected'),
+    [
+        *(
+            ('matches', *row)
+            for row in (
+                (
+                    'fields.3.name',
+                    'intensity',
+                    'must have the fields u1 v1 .* got u1 v1 u2 intensity',
+                ),
+                ('fields.0.name', 'v1', 'got v1 v1'),
+                ('fields.1.datatype', 8, 'must have the fields'),
+                ('fields', [], 'got none'),
+                ('is_bigendian', True, 'got .* big endian'),
+                ('point_step', 0, ' 0 bytes$'),
+                ('width', 2**32 - 1, 'has 2400 bytes of data, but 4294967295x1 points need'),
+                (
+                    'data',
+                    lambda cloud: bytes(cloud.data)[:-1],
+                    'has 2399 bytes of data, but 30x1 points need 2400',
+                ),
+                (
+                    'data',
+                    changed_records('tau2', lambda column: column.put(5, np.inf)),
+                    '~/matches must be finite',
+                ),
+                (
+                    'data',
+                    changed_records('z2', lambda column: np.add(column, 1.0, out=column)),
+                    'the rays x2 y2 z2 of ~/matches must have length 1',
+                ),
+            )
+        ),
+        ('relative_pose', 'pose.pose.position.x', float('nan'), 'position .* length 1'),
+        ('relative_pose', 'pose.pose.orientation.w', float('nan'), 'orientation .* length 1'),
+        ('velocity', 'twist.twist.linear.z', float('nan'), 'linear velocity .* must be finite'),
+        ('velocity', 'twist.twist.angular.z', float('inf'), 'angular velocity .* must be finite'),
+        ('velocity', 'twist.covariance.7', float('nan'), 'covariance of ~/velocity must '),
+        ('reference', 'time_ref.nanosec', 10**9, 'stamp is out of range'),
+        ('reference', 'time_ref.sec', 5, 'must name the same reference keyframe'),
+        ('matches', 'header.stamp.sec', 5, 'same stamp'),
+        ('velocity', 'header.stamp.sec', -1, 'stamp is out of range'),
+        ('pairs', 'status', [], 'must have one status, got 0'),
+        ('pairs', 'status.0.values', [], 'must have the key topics'),
+        ('pairs', 'status.0.values.0.key', 'other', 'must have the key reference_stamp_ns'),
+        ('pairs', 'status.0.values.0.value', '-5', 'reference_stamp_ns .* a timestamp'),
+        ('pairs', 'status.0.values.-4.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
+        ('pairs', 'status.0.values.-4.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
+        ('pairs', 'status.0.values.-6.value', '0.1 0.2', 'image_information .* unknowns'),
+        ('pairs', 'status.0.values.-6.value', '0.1 0.2 inf', 'image_gradient .* finite'),
+        ('pairs', 'status.0.values.-1.value', 'matches', 'must name all others'),
+        (
+            'pairs',
+            'status.0.values.-1.value',
+            'relative_rotation',
+            'lists pairs relative_rotation',
+        ),
+    ],
+)
 def test_unusable_messages_are_refused(pairs, topic, path, value, expected):
     if path == 'data':
         set_data(pairs[0][topic], value(pairs[0][topic]))
@@ -233,16 +293,24 @@ def test_nothing_is_left_of_an_unusable_pair(pairs):
     assert completed(synchronizer, pairs[1])[-1]
 
 
-@pytest.mark.parametrize(('call', 'expected'), [
-    (lambda: PairSynchronizer().add('tf', None), "^topic must be one of relative_pose, .* 'tf'"),
-    (lambda: PairSynchronizer(capacity=0), '^capacity must be .*, got 0'),
-    (lambda: PoseChain(min_shared_tracks=0), '^min_shared_tracks must be .*, got 0')])
+@pytest.mark.parametrize(
+    ('call', 'expected'),
+    [
+        (
+            lambda: PairSynchronizer().add('tf', None),
+            "^topic must be one of relative_pose, .* 'tf'",
+        ),
+        (lambda: PairSynchronizer(capacity=0), '^capacity must be .*, got 0'),
+        (lambda: PoseChain(min_shared_tracks=0), '^min_shared_tracks must be .*, got 0'),
+    ],
+)
 def test_usage_is_checked(call, expected):
     with pytest.raises(InputError, match=expected):
         call()
 
 
 # -- poses chained with their scale: against a simulated flight, and where it is lost ---------
+
 
 def published(pairs: list[PairResult]) -> list[module.PublishedPair]:
     """As a subscriber gets them: float32 matches."""
@@ -254,8 +322,12 @@ def chained(pairs: list[PairResult], **options: int) -> list[module.PathStep]:
     return [chain.add(pair) for pair in published(pairs)]
 
 
-def assert_path(steps: list[module.PathStep], positions: np.ndarray, rotations: list[np.ndarray],
-                atol: float = 2e-5) -> None:
+def assert_path(
+    steps: list[module.PathStep],
+    positions: np.ndarray,
+    rotations: list[np.ndarray],
+    atol: float = 2e-5,
+) -> None:
     poses = [pose for step in steps for pose in step.poses]
     # Rays come as float32.
     np.testing.assert_allclose([pose.position for pose in poses], positions, atol=atol)
@@ -267,10 +339,13 @@ def test_path_is_the_flight_in_units_of_its_first_baseline(seed):
     flight = simulated_flight(seed)
     steps = chained(flight.pairs)
     assert [pose.stamp_ns for step in steps for pose in step.poses] == [
-        flight.pairs[0].reference_stamp_ns, *(pair.stamp_ns for pair in flight.pairs)]
+        flight.pairs[0].reference_stamp_ns,
+        *(pair.stamp_ns for pair in flight.pairs),
+    ]
     assert_path(steps, flight.positions / flight.baselines[0], flight.R)
-    np.testing.assert_allclose([step.scale for step in steps],
-                               flight.baselines / flight.baselines[0], rtol=1e-5)
+    np.testing.assert_allclose(
+        [step.scale for step in steps], flight.baselines / flight.baselines[0], rtol=1e-5
+    )
     # Baselines differ by more than a factor of 3: nothing of this is by accident.
     assert np.ptp(np.log(flight.baselines)) > 1.0
     assert [bool(step.new_path) for step in steps] == [True, False, False, False]
@@ -295,19 +370,29 @@ def test_parallel_rays_have_no_distance():
 def test_too_few_shared_tracks_begin_a_new_path():
     everything = np.arange(40)
     flight = simulated_flight(
-        0, 40, tracks=[everything[:24], everything[16:], everything[:23], everything])
+        0, 40, tracks=[everything[:24], everything[16:], everything[:23], everything]
+    )
     steps = chained(flight.pairs)
     assert [step.shared_tracks for step in steps] == [0, 8, 0, 23]
     assert steps[2].new_path.startswith('7 shared tracks, the scale needs 8: ')
     assert [bool(step.new_path) for step in chained(flight.pairs, min_shared_tracks=9)] == [
-        True, True, True, False]
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
-@pytest.mark.parametrize(('places', 'unit', 'atol'), [
-    # The points are in other rows before and after, where this camera is not quite where it was.
-    ((0.0, 0.2, 0.2, 0.2, 0.6), 0, 1e-3),
-    # In units of the first pair that has a baseline.
-    ((0.0, 0.0, 0.5, 0.6, 1.0), 1, 2e-5)])
+@pytest.mark.parametrize(
+    ('places', 'unit', 'atol'),
+    [
+        # The points are in other rows before and after, where this camera is not quite where it
+        # was.
+        ((0.0, 0.2, 0.2, 0.2, 0.6), 0, 1e-3),
+        # In units of the first pair that has a baseline.
+        ((0.0, 0.0, 0.5, 0.6, 1.0), 1, 2e-5),
+    ],
+)
 def test_a_pure_rotation_is_part_of_the_path(places, unit, atol):
     """The position is unchanged; place, axes and scale continue after it."""
     flight = simulated_flight(0, places=places)
@@ -315,17 +400,27 @@ def test_a_pure_rotation_is_part_of_the_path(places, unit, atol):
     assert [bool(step.new_path) for step in steps] == [True, False, False, False]
     assert_path(steps, flight.positions / flight.baselines[unit], flight.R, atol)
     moves = flight.baselines > 0.0
-    np.testing.assert_allclose([step.scale for step in steps], np.where(
-        moves, flight.baselines / flight.baselines[unit], np.nan), rtol=1e-3)
+    np.testing.assert_allclose(
+        [step.scale for step in steps],
+        np.where(moves, flight.baselines / flight.baselines[unit], np.nan),
+        rtol=1e-3,
+    )
     assert (np.array([step.shared_tracks for step in steps])[~moves] == 0).all()
     assert steps[-1].shared_tracks == 120
 
 
-@pytest.mark.parametrize(('change', 'new_axes', 'reason'), [
-    (lambda pair: [], True, 'a pair is missing: '),
-    (lambda pair: [rotation_only(pair, Status.LOW_PARALLAX)], False,
-     'a pair has no translation (LOW_PARALLAX): '),
-    (lambda pair: [without_rotation(pair)], True, 'a pair has no rotation (NO_CONSENSUS): ')])
+@pytest.mark.parametrize(
+    ('change', 'new_axes', 'reason'),
+    [
+        (lambda pair: [], True, 'a pair is missing: '),
+        (
+            lambda pair: [rotation_only(pair, Status.LOW_PARALLAX)],
+            False,
+            'a pair has no translation (LOW_PARALLAX): ',
+        ),
+        (lambda pair: [without_rotation(pair)], True, 'a pair has no rotation (NO_CONSENSUS): '),
+    ],
+)
 def test_the_path_ends_and_without_a_rotation_its_axes(change, new_axes, reason):
     flight = simulated_flight(0)
     first, second, *others = flight.pairs
@@ -336,12 +431,17 @@ def test_the_path_ends_and_without_a_rotation_its_axes(change, new_axes, reason)
     assert [found.new_path for found in (*lost, last)] == [''] * (len(lost) + 1)
     assert (step.new_axes, last.new_axes) == (new_axes, False)
     assert (step.scale, step.shared_tracks) == (1.0, 0)
-    assert [pose.stamp_ns for pose in step.poses] == [others[0].reference_stamp_ns,
-                                                      others[0].stamp_ns]
+    assert [pose.stamp_ns for pose in step.poses] == [
+        others[0].reference_stamp_ns,
+        others[0].stamp_ns,
+    ]
     # Shifted and of another scale; rotated if the axes are new.
     axes = flight.R[2].T if new_axes else np.eye(3)
-    assert_path([step, last], (flight.positions[2:] - flight.positions[2]) @ axes.T
-                / flight.baselines[2], [axes @ R for R in flight.R[2:]])
+    assert_path(
+        [step, last],
+        (flight.positions[2:] - flight.positions[2]) @ axes.T / flight.baselines[2],
+        [axes @ R for R in flight.R[2:]],
+    )
 
 
 def test_wrong_tracks_do_not_move_the_scale_much():
@@ -356,7 +456,7 @@ def test_wrong_tracks_do_not_move_the_scale_much():
     assert step.scale == pytest.approx(flight.baselines[1] / flight.baselines[0], rel=1e-4)
 
 
-@pytest.mark.parametrize('noise', [1e-4, 3e-4])   # rad
+@pytest.mark.parametrize('noise', [1e-4, 3e-4])  # rad
 def test_sigma_of_the_scale(noise):
     """Of 200 draws of the rays' noise, against their scatter."""
     flight, rng = simulated_flight(3), np.random.default_rng(5)

@@ -31,10 +31,13 @@ pytestmark = pytest.mark.recordings
 # README of the recording: fitted to gyro against the images' rotation.
 GYRO_BIAS = (-0.0016, 0.0250, 0.0777)
 # config.yaml of the recording: noise of its ADIS16448. The bias was fitted, on this sensor.
-IMU = ImuConfig(gyro_bias=GYRO_BIAS, gyro_noise_density=1.7e-4, gyro_bias_sigma=3e-3,
-                imu_buffer_seconds=60.0)
-CALIBRATED = [458.654, 457.296, 367.215, 248.375], [-0.28340811, 0.07395907, 0.00019359,
-                                                    1.76187114e-05]
+IMU = ImuConfig(
+    gyro_bias=GYRO_BIAS, gyro_noise_density=1.7e-4, gyro_bias_sigma=3e-3, imu_buffer_seconds=60.0
+)
+CALIBRATED = (
+    [458.654, 457.296, 367.215, 248.375],
+    [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05],
+)
 HALF_SECOND = 500_000_000
 
 
@@ -42,7 +45,7 @@ HALF_SECOND = 500_000_000
 def body_from_camera(recordings):
     """T_BS (4, 4): body (the IMU) from camera."""
     text = (recordings / 'euroc_v101_10frames' / 'cam0_sensor.yaml').read_text()
-    T = yaml.safe_load(text.split('\n', 1)[1])['T_BS']['data']   # the first line is %YAML
+    T = yaml.safe_load(text.split('\n', 1)[1])['T_BS']['data']  # the first line is %YAML
     return np.array(T).reshape(4, 4)
 
 
@@ -53,8 +56,17 @@ def R_cam_imu(body_from_camera):
 
 def camera_of(intrinsics, distortion, **changes):
     fx, fy, cx, cy = intrinsics
-    return RollingShutterCamera(width=752, height=480, fx=fx, fy=fy, cx=cx, cy=cy,
-                                distortion=tuple(distortion), readout_time=0.0, **changes)
+    return RollingShutterCamera(
+        width=752,
+        height=480,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=tuple(distortion),
+        readout_time=0.0,
+        **changes,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +89,14 @@ def corners(recordings):
             if len(lines) < 24:
                 continue
             table = np.loadtxt(io.StringIO('\n'.join(lines)), delimiter=',', usecols=range(5, 12))
-            frames.append(Corners(int(lines[0].split(',')[0]),
-                                  (4 * table[:, 5] + table[:, 6]).astype(int),
-                                  table[:, :2].copy(), table[:, 2:5].copy()))
+            frames.append(
+                Corners(
+                    int(lines[0].split(',')[0]),
+                    (4 * table[:, 5] + table[:, 6]).astype(int),
+                    table[:, :2].copy(),
+                    table[:, 2:5].copy(),
+                )
+            )
     return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 
@@ -117,7 +134,7 @@ def all_samples(folder, config=IMU):
     stamps = np.loadtxt(path, delimiter=',', usecols=0, dtype=np.int64, comments='#')
     values = np.loadtxt(path, delimiter=',', usecols=range(1, 7), comments='#')
     buffer = ImuBuffer(config)
-    buffer._keep_ns = 10**12   # the whole recording at once
+    buffer._keep_ns = 10**12  # the whole recording at once
     for stamp, value in zip(stamps.tolist(), values, strict=True):
         buffer.add(ImuSample(stamp, tuple(value[:3]), tuple(value[3:])))
     return buffer
@@ -127,17 +144,26 @@ def half_seconds(frames, imu):
     """Pairs of frames half a second apart, within the IMU's time."""
     stamps = np.array([frame.stamp_ns for frame in frames])
     later = np.searchsorted(stamps, stamps + HALF_SECOND - 10_000_000)
-    return [(i, j) for i, j in enumerate(later) if j < len(stamps)
-            and abs(stamps[j] - stamps[i] - HALF_SECOND) < 10_000_000
-            and imu.gyro.coverage(int(stamps[i]), int(stamps[j])) is Coverage.AVAILABLE]
+    return [
+        (i, j)
+        for i, j in enumerate(later)
+        if j < len(stamps)
+        and abs(stamps[j] - stamps[i] - HALF_SECOND) < 10_000_000
+        and imu.gyro.coverage(int(stamps[i]), int(stamps[j])) is Coverage.AVAILABLE
+    ]
 
 
 def test_gyro_over_half_a_second(corners, given, imu, R_cam_imu, recordings):
     """The requirement: 0.4 deg in the median."""
+
     def errors(frames, imu):
-        return [rotation_error(
-            R_cam_imu @ imu.rotation(frames[i].stamp_ns, frames[j].stamp_ns)[0] @ R_cam_imu.T,
-            relative(given[i], given[j])[0]) for i, j in half_seconds(frames, imu)]
+        return [
+            rotation_error(
+                R_cam_imu @ imu.rotation(frames[i].stamp_ns, frames[j].stamp_ns)[0] @ R_cam_imu.T,
+                relative(given[i], given[j])[0],
+            )
+            for i, j in half_seconds(frames, imu)
+        ]
 
     found = errors(corners, imu)
     assert len(found) > 1000
@@ -150,9 +176,11 @@ def test_gyro_over_half_a_second(corners, given, imu, R_cam_imu, recordings):
 def test_gravity_of_a_hand_held_camera(corners, given, recordings, R_cam_imu):
     """Truth is "up" of the target: the mean specific force in its frame."""
     imu = all_samples(recordings / 'euroc_imu_april_corners', ImuConfig(gyro_bias=GYRO_BIAS))
-    R_imu_target = {frame.stamp_ns: R_cam_imu.T @ R
-                    for frame, (R, _) in zip(corners, given, strict=True)
-                    if imu.gyro.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE}
+    R_imu_target = {
+        frame.stamp_ns: R_cam_imu.T @ R
+        for frame, (R, _) in zip(corners, given, strict=True)
+        if imu.gyro.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE
+    }
     up = np.mean([imu.force.between(at, at)[1][0] @ R for at, R in R_imu_target.items()], axis=0)
     errors, sigmas = [], []
     for at, R in R_imu_target.items():
@@ -176,18 +204,30 @@ def relative_pose(a, b, camera, imu, R, rng=0, **config):
     rotation, covariance = imu.rotation(a.stamp_ns, b.stamp_ns)
     config = {'gravity_sigma': max(frame.gravity_sigma for frame in frames), **config}
     return estimate_relative_pose(
-        a.pixels[first], b.pixels[second], camera, frames[0].motion, frames[1].motion,
-        R @ rotation @ R.T, R @ covariance @ R.T, (b.stamp_ns - a.stamp_ns) * 1e-9,
-        EstimatorConfig(**config), rng=rng)
+        a.pixels[first],
+        b.pixels[second],
+        camera,
+        frames[0].motion,
+        frames[1].motion,
+        R @ rotation @ R.T,
+        R @ covariance @ R.T,
+        (b.stamp_ns - a.stamp_ns) * 1e-9,
+        EstimatorConfig(**config),
+        rng=rng,
+    )
 
 
 def far_pairs(corners, truth, imu, every):
     """Pairs of at least 10 cm of baseline and 24 common corners, half a second apart."""
-    start = corners[0].stamp_ns + 10_000_000_000   # gravity has settled
-    return [(i, j) for i, j in half_seconds(corners, imu)
-            if i % every == 0 and corners[i].stamp_ns > start
-            and np.linalg.norm(relative(truth[i], truth[j])[1]) >= 0.1
-            and len(np.intersect1d(corners[i].numbers, corners[j].numbers)) >= 24]
+    start = corners[0].stamp_ns + 10_000_000_000  # gravity has settled
+    return [
+        (i, j)
+        for i, j in half_seconds(corners, imu)
+        if i % every == 0
+        and corners[i].stamp_ns > start
+        and np.linalg.norm(relative(truth[i], truth[j])[1]) >= 0.1
+        and len(np.intersect1d(corners[i].numbers, corners[j].numbers)) >= 24
+    ]
 
 
 def test_two_views_of_the_target(corners, given, imu, R_cam_imu):
@@ -208,6 +248,7 @@ def test_two_views_of_the_target(corners, given, imu, R_cam_imu):
 
 # -- ten frames in flight ---------------------------------------------------------------------
 
+
 @pytest.fixture(scope='module')
 def flight(recordings, body_from_camera):
     """Stamp, image, R (camera from world) and position of the camera."""
@@ -216,19 +257,27 @@ def flight(recordings, body_from_camera):
     frames = []
     for path in sorted((folder / 'cam0').glob('*.jpg')):
         k = int(np.argmin(np.abs(table[:, 0] - float(path.stem))))
-        assert abs(table[k, 0] - float(path.stem)) < 2e6   # 2 ms
+        assert abs(table[k, 0] - float(path.stem)) < 2e6  # 2 ms
         # Read as the recording's README says: camera from world. The positions are those of the
         # body, and not of the camera as in the README: with the lever arm of 7 cm the epipolar
         # residual of the truth is half as large.
         R = Rotation.from_quat(table[k, [5, 6, 7, 4]]).as_matrix()
-        frames.append((int(path.stem), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), R,
-                       table[k, 1:4] + R.T @ body_from_camera[:3, :3].T @ body_from_camera[:3, 3]))
+        frames.append(
+            (
+                int(path.stem),
+                cv2.imread(str(path), cv2.IMREAD_GRAYSCALE),
+                R,
+                table[k, 1:4] + R.T @ body_from_camera[:3, :3].T @ body_from_camera[:3, 3],
+            )
+        )
     return frames
 
 
-@pytest.mark.parametrize('config', [
-    TrackingConfig(), TrackingConfig(max_features=800, min_feature_distance=5.0)],
-    ids=['default', 'more'])
+@pytest.mark.parametrize(
+    'config',
+    [TrackingConfig(), TrackingConfig(max_features=800, min_feature_distance=5.0)],
+    ids=['default', 'more'],
+)
 @pytest.mark.parametrize('step', [1, -1], ids=['forth', 'back'])
 def test_ten_frames_in_flight(flight, recordings, R_cam_imu, step, config):
     """The requirement: 0.3 deg and 5 deg at nine frames' distance, by the project's tracker."""
@@ -240,15 +289,23 @@ def test_ten_frames_in_flight(flight, recordings, R_cam_imu, step, config):
     for _, image, *_ in frames:
         tracker.track(image, None)
     matches, (end, _, R2, p2) = tracker.refined_matches(), frames[-1]
-    rotation, covariance = (R_cam_imu @ found @ R_cam_imu.T
-                            for found in imu.rotation(min(start, end), max(start, end)))
+    rotation, covariance = (
+        R_cam_imu @ found @ R_cam_imu.T for found in imu.rotation(min(start, end), max(start, end))
+    )
     if start > end:
         rotation, covariance = rotation.T, rotation.T @ covariance @ rotation
     frames = [frame_imu(imu, (at, at), at, R_cam_imu) for at in (start, end)]
     pose = estimate_relative_pose(
-        matches.points1, matches.points2, camera_of(*CALIBRATED), frames[0].motion,
-        frames[1].motion, rotation, covariance, abs(end - start) * 1e-9,
-        EstimatorConfig(gravity_sigma=max(f.gravity_sigma for f in frames)))
+        matches.points1,
+        matches.points2,
+        camera_of(*CALIBRATED),
+        frames[0].motion,
+        frames[1].motion,
+        rotation,
+        covariance,
+        abs(end - start) * 1e-9,
+        EstimatorConfig(gravity_sigma=max(f.gravity_sigma for f in frames)),
+    )
     assert pose
     assert rotation_error(pose.R, R1 @ R2.T) <= 0.3
     assert direction_error(pose.t, R1 @ (p2 - p1)) <= 5.0
@@ -261,8 +318,12 @@ def test_ten_frames_in_flight(flight, recordings, R_cam_imu, step, config):
 # the model is OpenCV's 5-point, refined by SciPy.
 
 # Every second frame is a keyframe, and the gyro only derotates rows.
-EVERY_SECOND = ['use_gyro_rotation=false', 'max_keyframe_frames=2', 'min_keyframe_parallax=100.0',
-                'min_tracked_fraction=0.05']
+EVERY_SECOND = [
+    'use_gyro_rotation=false',
+    'max_keyframe_frames=2',
+    'min_keyframe_parallax=100.0',
+    'min_tracked_fraction=0.05',
+]
 THRESHOLD = 1.0  # px, of the robust cost
 # The hood of the car is visible below row 420 (README of the recording).
 LAST_ROW = {'xiaomi_cc9_rs': 420.0}
@@ -272,7 +333,9 @@ def sampson_errors(R, b, x1, x2):
     """For ``(x_1 x R x_2) . b = 0`` in the normalised planes (N, 3); b (N, 3): of each match."""
     n = np.cross(b, x2 @ R.T)
     k = np.cross(x1, b) @ R
-    return (x1 * n).sum(axis=1) / np.sqrt((n[:, :2]**2).sum(axis=1) + (k[:, :2]**2).sum(axis=1))
+    return (x1 * n).sum(axis=1) / np.sqrt(
+        (n[:, :2] ** 2).sum(axis=1) + (k[:, :2] ** 2).sum(axis=1)
+    )
 
 
 def robust_cost(rays1, rays2, focal_length, row_times=None):
@@ -284,9 +347,13 @@ def robust_cost(rays1, rays2, focal_length, row_times=None):
     x1, x2 = rays1 / rays1[:, 2:], rays2 / rays2[:, 2:]
     cv2.setRNGSeed(0)
     essential, _ = cv2.findEssentialMat(
-        focal_length * x2[:, :2], focal_length * x1[:, :2],
-        np.diag([focal_length, focal_length, 1.0]), method=cv2.USAC_MAGSAC, prob=0.999,
-        threshold=1.0)
+        focal_length * x2[:, :2],
+        focal_length * x1[:, :2],
+        np.diag([focal_length, focal_length, 1.0]),
+        method=cv2.USAC_MAGSAC,
+        prob=0.999,
+        threshold=1.0,
+    )
     R1, R2, t = cv2.decomposeEssentialMat(essential)
     best = np.inf
     for R in (R1, R2):
@@ -300,18 +367,23 @@ def robust_cost(rays1, rays2, focal_length, row_times=None):
             if row_times is not None:
                 b += np.outer(row_times[1], p[8:]) - np.outer(row_times[0], p[5:8])
             return focal_length * sampson_errors(
-                Rotation.from_rotvec(p[:3]).as_matrix() @ R, b, x1, x2)
+                Rotation.from_rotvec(p[:3]).as_matrix() @ R, b, x1, x2
+            )
 
-        fit = least_squares(lambda p, errors=errors: np.concatenate([errors(p), 0.1 * p[5:]]),
-                            np.zeros(5 if row_times is None else 11), loss='cauchy',
-                            f_scale=0.5 * THRESHOLD)
-        best = min(best, float(np.minimum((errors(fit.x) / THRESHOLD)**2, 1.0).mean()))
+        fit = least_squares(
+            lambda p, errors=errors: np.concatenate([errors(p), 0.1 * p[5:]]),
+            np.zeros(5 if row_times is None else 11),
+            loss='cauchy',
+            f_scale=0.5 * THRESHOLD,
+        )
+        best = min(best, float(np.minimum((errors(fit.x) / THRESHOLD) ** 2, 1.0).mean()))
     return best
 
 
 # The RealSense has 0.0999 with OpenCV 4.6.
-@pytest.mark.parametrize(('name', 'required'), [
-    ('realsense_rgb_rs', 0.095), ('xiaomi_cc9_rs', 0.4)])
+@pytest.mark.parametrize(
+    ('name', 'required'), [('realsense_rgb_rs', 0.095), ('xiaomi_cc9_rs', 0.4)]
+)
 def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, converted):
     """The requirement: by 40 % (Xiaomi), and by 20 % (RealSense), or half of what is possible.
 
@@ -328,15 +400,21 @@ def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, c
         camera = sensor_model(intrinsics, parameters.sensor).camera
     for pair in pairs[::2]:
         points = pair.matches.points1, pair.matches.points2
-        use = (np.maximum(points[0], points[1])[:, 1] < LAST_ROW.get(name, np.inf))
+        use = np.maximum(points[0], points[1])[:, 1] < LAST_ROW.get(name, np.inf)
         measured = [camera.unproject(intrinsics.to_sensor(p[use])) for p in points]
         derotated = [rays[use] for rays in (pair.rays1, pair.rays2)]
         # As far to the other side of the measured ray.
-        wrong = [2.0 * (f * g).sum(axis=1, keepdims=True) * f - g
-                 for f, g in zip(measured, derotated, strict=True)]
+        wrong = [
+            2.0 * (f * g).sum(axis=1, keepdims=True) * f - g
+            for f, g in zip(measured, derotated, strict=True)
+        ]
         times = [times[use] for times in (pair.row_times1, pair.row_times2)]
-        costs.append([*(robust_cost(*rays, camera.fx) for rays in (measured, derotated, wrong)),
-                      robust_cost(*derotated, camera.fx, times)])
+        costs.append(
+            [
+                *(robust_cost(*rays, camera.fx) for rays in (measured, derotated, wrong)),
+                robust_cost(*derotated, camera.fx, times),
+            ]
+        )
     assert len(costs) >= 20
     measured, derotated, wrong_sign, with_velocities = np.sum(costs, axis=0)
     assert wrong_sign > 1.1 * measured

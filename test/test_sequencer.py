@@ -22,14 +22,16 @@ MS = 1_000_000
 SECOND = 1000 * MS
 READOUT_NS = 20 * MS
 START = 1_700_000_000 * SECOND
-INTRINSICS = Intrinsics(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
-                        image_width=32, image_height=20)
+INTRINSICS = Intrinsics(
+    width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0, image_width=32, image_height=20
+)
 IMAGE = np.zeros((20, 32), dtype=np.uint8)
 
 
 def parameters(**values):
-    return Parameters.from_mapping({
-        'readout_time': READOUT_NS / SECOND, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], **values})
+    return Parameters.from_mapping(
+        {'readout_time': READOUT_NS / SECOND, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], **values}
+    )
 
 
 def replaying(**values):
@@ -71,16 +73,19 @@ def live(clock):
     return Sequencer(parameters(), clock=clock)
 
 
-@pytest.mark.parametrize(('values', 'last_row_ms'), [
-    ({}, 109.0),   # the last row is read at 90 + 20 * 19/20 ms
-    ({'time_offset': 0.03}, 139.0),
-    ({'time_offset': -0.03}, 79.0),
-    ({'stamp_row': 'last'}, 90.0),
-    ({'readout_direction': 'up', 'stamp_row': 'last'}, 109.0),
-    ({'stamp_exposure': 'start', 'exposure_time': 0.01}, 119.0),
-    ({'exposure_time': 0.01}, 114.0),
-    ({'readout_time': 0.0}, 90.0),
-])
+@pytest.mark.parametrize(
+    ('values', 'last_row_ms'),
+    [
+        ({}, 109.0),  # the last row is read at 90 + 20 * 19/20 ms
+        ({'time_offset': 0.03}, 139.0),
+        ({'time_offset': -0.03}, 79.0),
+        ({'stamp_row': 'last'}, 90.0),
+        ({'readout_direction': 'up', 'stamp_row': 'last'}, 109.0),
+        ({'stamp_exposure': 'start', 'exposure_time': 0.01}, 119.0),
+        ({'exposure_time': 0.01}, 114.0),
+        ({'readout_time': 0.0}, 90.0),
+    ],
+)
 def test_a_frame_waits_for_the_end_of_its_exposure(clock, values, last_row_ms):
     sequencer = Sequencer(parameters(**values), clock=clock)
     add_imu(sequencer, 0, 50)
@@ -96,12 +101,15 @@ def test_the_segment_spans_to_the_last_processed_frame(live):
     """A refused frame must not interrupt the chain of gyro segments."""
     add_imu(live, 0, 400)
     add_frames(live, 100)
-    live.add_frame(CompressedImage(np.zeros(50, dtype=np.uint8), 'jpeg', START + 150 * MS),
-                   INTRINSICS)
+    live.add_frame(
+        CompressedImage(np.zeros(50, dtype=np.uint8), 'jpeg', START + 150 * MS), INTRINSICS
+    )
     add_frames(live, 200)
     first, refused, second = drain(live)
     assert (refused.refusal, refused.reason) == (
-        Refusal.BAD_IMAGE, 'compressed image of 50 bytes is neither JPEG nor PNG')
+        Refusal.BAD_IMAGE,
+        'compressed image of 50 bytes is neither JPEG nor PNG',
+    )
     assert second.imu.since_previous.stamps_ns[0] == first.imu.reference_ns
 
 
@@ -131,14 +139,23 @@ def test_latency_counts_from_the_later_of_image_and_imu(live, clock):
     assert [frame.ready_ns for frame in drain(live)] == [7, 13]
 
 
-@pytest.mark.parametrize(('imu_until', 'times_ms', 'refusal', 'released'), [
-    # Too slow a worker: the oldest are dropped.
-    (1000, range(0, 800, 100), Refusal.OVERLOAD, MAILBOX_FRAMES),
-    # Frames that wait for the IMU are not overload.
-    (5, range(100, 120 + 10 * module.WAITING_FRAMES, 10), Refusal.NO_IMU,
-     module.WAITING_FRAMES)])
-def test_the_queue_is_bounded_and_the_oldest_are_counted(live, imu_until, times_ms, refusal,
-                                                         released):
+@pytest.mark.parametrize(
+    ('imu_until', 'times_ms', 'refusal', 'released'),
+    [
+        # Too slow a worker: the oldest are dropped.
+        (1000, range(0, 800, 100), Refusal.OVERLOAD, MAILBOX_FRAMES),
+        # Frames that wait for the IMU are not overload.
+        (
+            5,
+            range(100, 120 + 10 * module.WAITING_FRAMES, 10),
+            Refusal.NO_IMU,
+            module.WAITING_FRAMES,
+        ),
+    ],
+)
+def test_the_queue_is_bounded_and_the_oldest_are_counted(
+    live, imu_until, times_ms, refusal, released
+):
     add_imu(live, 0, imu_until)
     add_frames(live, *times_ms)
     add_imu(live, imu_until, 400)
@@ -188,24 +205,78 @@ def imu(first_ms, last_ms, step_ms=5):
 
 # Frames by their times, and the times of IMU samples; of the frames that are released those that
 # restart the tracking, and those without the gyro since the frame before.
-@pytest.mark.parametrize((
-    'events', 'released', 'restarted', 'alone', 'refused', 'gaps', 'jumps'), [
-    ((imu(0, 1000), 100, 200, 200, 150, 300), [100, 200, 300], [], [100],
-     [Refusal.DUPLICATE, Refusal.OUT_OF_ORDER], 0, 0),
-    # More frames in the gap than may wait for the worker: it is no overload.
-    ((-5, imu(0, 100), 50, *range(90, 210, 15), imu(200, 400), 250), [50, 250], [], [50, 250],
-     [Refusal.IMU_GAP] * 9, 1, 0),
-    # A bag that loops, while a frame waits for its IMU.
-    ((imu(0, 5000, 10), 4900, 4990, imu(0, 200), 100, imu(205, 300), 200), [4900, 100, 200],
-     [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
-    ((imu(0, 5000, 10), 4900, 4990, 100, imu(0, 200), imu(205, 300), 200), [4900, 100, 200],
-     [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
-    # Single stamps far ahead, of a frame, then of the IMU; a frame of stamp zero.
-    ((imu(20_000, 20_200), 20_050, 100_000, 20_100, [100_000], imu(20_205, 20_400), 0, 20_300),
-     [20_050, 20_100, 20_300], [], [20_050], [Refusal.OUT_OF_ORDER] * 2, 0, 0),
-    # Clocks that jump ahead: of two stamps the first is not used.
-    ((imu(0, 200), 100, imu(100_000, 100_400), 100_100, 100_200), [100, 100_200], [],
-     [100, 100_200], [Refusal.OUT_OF_ORDER], 1, 0)])
+@pytest.mark.parametrize(
+    ('events', 'released', 'restarted', 'alone', 'refused', 'gaps', 'jumps'),
+    [
+        (
+            (imu(0, 1000), 100, 200, 200, 150, 300),
+            [100, 200, 300],
+            [],
+            [100],
+            [Refusal.DUPLICATE, Refusal.OUT_OF_ORDER],
+            0,
+            0,
+        ),
+        # More frames in the gap than may wait for the worker: it is no overload.
+        (
+            (-5, imu(0, 100), 50, *range(90, 210, 15), imu(200, 400), 250),
+            [50, 250],
+            [],
+            [50, 250],
+            [Refusal.IMU_GAP] * 9,
+            1,
+            0,
+        ),
+        # A bag that loops, while a frame waits for its IMU.
+        (
+            (imu(0, 5000, 10), 4900, 4990, imu(0, 200), 100, imu(205, 300), 200),
+            [4900, 100, 200],
+            [100],
+            [4900, 100],
+            [Refusal.CLOCK_JUMP],
+            0,
+            1,
+        ),
+        (
+            (imu(0, 5000, 10), 4900, 4990, 100, imu(0, 200), imu(205, 300), 200),
+            [4900, 100, 200],
+            [100],
+            [4900, 100],
+            [Refusal.CLOCK_JUMP],
+            0,
+            1,
+        ),
+        # Single stamps far ahead, of a frame, then of the IMU; a frame of stamp zero.
+        (
+            (
+                imu(20_000, 20_200),
+                20_050,
+                100_000,
+                20_100,
+                [100_000],
+                imu(20_205, 20_400),
+                0,
+                20_300,
+            ),
+            [20_050, 20_100, 20_300],
+            [],
+            [20_050],
+            [Refusal.OUT_OF_ORDER] * 2,
+            0,
+            0,
+        ),
+        # Clocks that jump ahead: of two stamps the first is not used.
+        (
+            (imu(0, 200), 100, imu(100_000, 100_400), 100_100, 100_200),
+            [100, 100_200],
+            [],
+            [100, 100_200],
+            [Refusal.OUT_OF_ORDER],
+            1,
+            0,
+        ),
+    ],
+)
 def test_gaps_and_jumps(live, events, released, restarted, alone, refused, gaps, jumps):
     items = []
     for event in events:
@@ -246,13 +317,17 @@ def test_a_clock_that_is_set_back_by_less_than_a_second(live):
 STEADY = tuple(range(0, 300, 5))
 
 
-@pytest.mark.parametrize('order, repeated, late, gaps', [
-    (STEADY, 0, 0, 0),
-    ([ms for ms in STEADY for _ in range(2)], 60, 0, 0),
-    ([*STEADY[:20], STEADY[21], STEADY[20], *STEADY[22:]], 0, 1, 0),
-    ([STEADY[k ^ 1] for k in range(60)], 0, 30, 0),
-    ([*STEADY[:40], *STEADY[55:]], 0, 0, 1),
-], ids=['steady', 'repeated', 'late', 'each second one late', 'gap'])
+@pytest.mark.parametrize(
+    'order, repeated, late, gaps',
+    [
+        (STEADY, 0, 0, 0),
+        ([ms for ms in STEADY for _ in range(2)], 60, 0, 0),
+        ([*STEADY[:20], STEADY[21], STEADY[20], *STEADY[22:]], 0, 1, 0),
+        ([STEADY[k ^ 1] for k in range(60)], 0, 30, 0),
+        ([*STEADY[:40], *STEADY[55:]], 0, 0, 1),
+    ],
+    ids=['steady', 'repeated', 'late', 'each second one late', 'gap'],
+)
 def test_imu_stamps_are_counted_and_change_no_frame_elsewhere(order, repeated, late, gaps):
     knots = []
     for stamps_ms in (STEADY, order):
@@ -263,18 +338,26 @@ def test_imu_stamps_are_counted_and_change_no_frame_elsewhere(order, repeated, l
         knots.append(sequencer.take().imu.motion.knot_rotations)
     counts = sequencer.counts()
     assert (counts.imu_repeated, counts.imu_late, counts.imu_gaps, counts.clock_jumps) == (
-        repeated, late, gaps, 0)
+        repeated,
+        late,
+        gaps,
+        0,
+    )
     np.testing.assert_array_equal(*knots)
 
 
 @settings(max_examples=30)
-@given(early=st.lists(st.integers(0, 30), min_size=14, max_size=14),
-       takes=st.sets(st.integers(0, 199)))
+@given(
+    early=st.lists(st.integers(0, 30), min_size=14, max_size=14),
+    takes=st.sets(st.integers(0, 199)),
+)
 def test_interleaving_does_not_change_the_result(early, takes):
     """However early images come, and whenever frames are taken: IMU data are equal bit by bit."""
     rng = np.random.default_rng(1)
-    samples = [sample(5 * k, tuple(rng.normal(size=3)), tuple(rng.normal(size=3) - [0, 9.8, 0]))
-               for k in range(200)]
+    samples = [
+        sample(5 * k, tuple(rng.normal(size=3)), tuple(rng.normal(size=3) - [0, 9.8, 0]))
+        for k in range(200)
+    ]
     times_ms = list(range(33, 957, 66))
     patient, eager, items = replaying(), replaying(), []
     for one in samples:
@@ -282,8 +365,10 @@ def test_interleaving_does_not_change_the_result(early, takes):
     add_frames(patient, *times_ms)
     due = np.maximum.accumulate([ms // 5 - k for ms, k in zip(times_ms, early, strict=True)])
     for k, one in enumerate(samples):
-        add_frames(eager, *(ms for ms, at in zip(times_ms, due, strict=True)
-                            if at == k or (k == 0 and at < 0)))
+        add_frames(
+            eager,
+            *(ms for ms, at in zip(times_ms, due, strict=True) if at == k or (k == 0 and at < 0)),
+        )
         eager.add_imu(one)
         items += drain(eager) if k in takes else []
     items += drain(eager)
@@ -294,8 +379,9 @@ def test_interleaving_does_not_change_the_result(early, takes):
         np.testing.assert_array_equal(a.imu.motion.gravity, b.imu.motion.gravity)
         np.testing.assert_array_equal(a.imu.motion.knot_rotations, b.imu.motion.knot_rotations)
         if a.imu.since_previous is not None:
-            np.testing.assert_array_equal(a.imu.since_previous.angular_velocities,
-                                          b.imu.since_previous.angular_velocities)
+            np.testing.assert_array_equal(
+                a.imu.since_previous.angular_velocities, b.imu.since_previous.angular_velocities
+            )
 
 
 BY_INTERVAL = {'time_offset_per_interval': -0.5, 'time_offset_reference_interval': 0.04}
@@ -303,8 +389,11 @@ BY_INTERVAL = {'time_offset_per_interval': -0.5, 'time_offset_reference_interval
 
 def offsets(sequencer):
     """Times of the first rows of released frames, after their stamps [ms]."""
-    return [(item.imu.reference_ns - item.stamp_ns) / MS
-            for item in drain(sequencer) if isinstance(item, Frame)]
+    return [
+        (item.imu.reference_ns - item.stamp_ns) / MS
+        for item in drain(sequencer)
+        if isinstance(item, Frame)
+    ]
 
 
 def test_the_offset_follows_the_interval_to_the_frame_before():
@@ -335,7 +424,7 @@ def test_a_frame_of_a_longer_interval_waits_for_its_own_last_row():
     add_imu(sequencer, 0, 160)
     add_frames(sequencer, 50, 90, 140)
     assert stamps(drain(sequencer)) == [50.0, 90.0]
-    for ms, released in ((165, []), (170, [140.0])):   # 140 + 10 + 19 = 169 ms
+    for ms, released in ((165, []), (170, [140.0])):  # 140 + 10 + 19 = 169 ms
         sequencer.add_imu(sample(ms))
         assert stamps(drain(sequencer)) == released
 
@@ -357,7 +446,9 @@ def test_a_shifted_frame_waits_for_its_shifted_rows(offline):
     assert since_start(*(frame.imu.reference_ns for frame in frames)) == [50, 120, 170]
     assert [frame.imu.applied_offset_ns for frame in frames] == [0, 20 * MS, 20 * MS]
     assert [since_start(*frame.imu.since_previous.stamps_ns[[0, -1]]) for frame in frames[1:]] == [
-        [50, 120], [120, 170]]
+        [50, 120],
+        [120, 170],
+    ]
     # Backwards by more than the gyro covers: a gap, as for any frame.
     sequencer.apply(Applied(-0.3))
     add_frames(sequencer, 200)
@@ -387,7 +478,7 @@ def jittering(rng, frames):
 def test_an_exposure_longer_than_the_interval_is_refused():
     sequencer = replaying(exposure_time=0.06)
     add_imu(sequencer, 0, 400)
-    add_frames(sequencer, 100, 150, 190)   # an interval of 50 ms may be jitter
+    add_frames(sequencer, 100, 150, 190)  # an interval of 50 ms may be jitter
     assert refusals(drain(sequencer)) == [Refusal.BAD_IMAGE]
 
 
@@ -396,17 +487,21 @@ def test_the_scatter_is_that_of_the_stamps_whether_or_not_frames_are_lost(frames
     rng, found = np.random.default_rng(0), []
     for _ in range(300):
         kept = np.delete(jittering(rng, frames), rng.choice(frames, lost, replace=False))
-        found.append(module.stamp_sigma(kept[-module.SCATTER_FRAMES:]))
+        found.append(module.stamp_sigma(kept[-module.SCATTER_FRAMES :]))
     assert np.mean(found) == pytest.approx(2.0e-3, rel=0.15)
 
 
-@pytest.mark.parametrize(('stamps_ns', 'most'), [
-    (EVEN, 0.0),
-    (np.delete(EVEN, [3, 4, 11, 30, 31, 32, 50]), 1e-6),   # lost frames
-    # An exposure that becomes longer.
-    (START + np.cumsum(np.repeat([33_173_000, 40_050_000], [20, 12])), 2e-4),
-    # A camera without a rhythm is bounded.
-    (START + np.cumsum(np.random.default_rng(2).integers(20_000_000, 200_000_000, 32)), 0.01),
-    *((jittering(np.random.default_rng(3), frames), 0.0) for frames in range(3))])
+@pytest.mark.parametrize(
+    ('stamps_ns', 'most'),
+    [
+        (EVEN, 0.0),
+        (np.delete(EVEN, [3, 4, 11, 30, 31, 32, 50]), 1e-6),  # lost frames
+        # An exposure that becomes longer.
+        (START + np.cumsum(np.repeat([33_173_000, 40_050_000], [20, 12])), 2e-4),
+        # A camera without a rhythm is bounded.
+        (START + np.cumsum(np.random.default_rng(2).integers(20_000_000, 200_000_000, 32)), 0.01),
+        *((jittering(np.random.default_rng(3), frames), 0.0) for frames in range(3)),
+    ],
+)
 def test_the_scatter_is_small_without_errors_and_bounded(stamps_ns, most):
     assert module.stamp_sigma(stamps_ns) <= most

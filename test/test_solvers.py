@@ -15,8 +15,14 @@ from rs_relpose_ros.solvers import angular_3pt, angular_5pt, global_5pt, linear_
 from rs_relpose_ros.solvers.api import SOLVERS
 
 uniform_11pt = solvers.uniform_11pt
-POINTS = {linear_9pt: 9, uniform_9pt: 9, angular_3pt: 3, angular_5pt: 5, global_5pt: 5,
-          uniform_11pt: 11}
+POINTS = {
+    linear_9pt: 9,
+    uniform_9pt: 9,
+    angular_3pt: 3,
+    angular_5pt: 5,
+    global_5pt: 5,
+    uniform_11pt: 11,
+}
 WITH_GRAVITY = (linear_9pt, uniform_9pt, angular_3pt)
 WITH_VELOCITIES = (linear_9pt, uniform_9pt, uniform_11pt)
 MEASURED = (linear_9pt, global_5pt)
@@ -56,10 +62,21 @@ def rays(solver, P):
 
 def solve(solver, P, k, start=None, noise=0.0):
     """All solutions of problem k, with `noise` (2, n, 3) added to its rays."""
-    f1, f2 = (f[k] + e for f, e in zip(rays(solver, P), np.broadcast_to(
-        noise, (2, POINTS[solver], 3)), strict=True))
-    return solver(f1, f2, P.tau1[k], P.tau2[k], gravity1=P.gravity1[k], gravity2=P.gravity2[k],
-                  start_rotations=P.R[k][None] if start is None else start)
+    f1, f2 = (
+        f[k] + e
+        for f, e in zip(
+            rays(solver, P), np.broadcast_to(noise, (2, POINTS[solver], 3)), strict=True
+        )
+    )
+    return solver(
+        f1,
+        f2,
+        P.tau1[k],
+        P.tau2[k],
+        gravity1=P.gravity1[k],
+        gravity2=P.gravity2[k],
+        start_rotations=P.R[k][None] if start is None else start,
+    )
 
 
 def angle(R, truth):
@@ -81,7 +98,7 @@ def rotation_errors(solver, P, count, **changes):
 
 def baselines(solution, tau1, tau2):
     """``t - tau_1 d_1 + tau_2 d_2`` (n, 3)."""
-    return (solution.t - tau1[:, None] * solution.v1 + tau2[:, None] * (solution.R @ solution.v2))
+    return solution.t - tau1[:, None] * solution.v1 + tau2[:, None] * (solution.R @ solution.v2)
 
 
 def residual(solution, f1, f2, tau1, tau2):
@@ -91,6 +108,7 @@ def residual(solution, f1, f2, tau1, tau2):
 
 
 # --- exact data
+
 
 @each_exact_case
 def test_solutions_of_exact_matches(solver, motion):
@@ -121,18 +139,24 @@ def test_solutions_of_exact_matches(solver, motion):
 
 
 @pytest.mark.parametrize('count', [2000, pytest.param(10_000, marks=pytest.mark.long)])
-@pytest.mark.parametrize(('solver', 'motion'), [
-    case for case in EXACT if case[0] is not uniform_11pt], ids=case_name)
+@pytest.mark.parametrize(
+    ('solver', 'motion'), [case for case in EXACT if case[0] is not uniform_11pt], ids=case_name
+)
 def test_closed_forms_find_the_truth(solver, motion, count):
     """The requirement is 99.9 % of random problems."""
     errors = rotation_errors(solver, problems(solver, 2, count, **motion), count)
-    print(f'{(errors > 1e-6).sum()} of {count} beyond 1e-6 deg, '
-          f'{(errors > 1e-3).sum()} beyond 1e-3 deg')
+    print(
+        f'{(errors > 1e-6).sum()} of {count} beyond 1e-6 deg, '
+        f'{(errors > 1e-3).sum()} beyond 1e-3 deg'
+    )
     assert (errors < 1e-6).mean() >= 0.999
 
 
-@pytest.mark.parametrize(('solver', 'motion'), [
-    (angular_3pt, STILL), (uniform_9pt, {}), (linear_9pt, {})], ids=case_name)
+@pytest.mark.parametrize(
+    ('solver', 'motion'),
+    [(angular_3pt, STILL), (uniform_9pt, {}), (linear_9pt, {})],
+    ids=case_name,
+)
 def test_the_number_of_solutions_is_that_of_an_eigenvalue_problem(solver, motion):
     """``A(psi)`` is quadratic in tan(psi / 2): its real eigenvalues (LAPACK) are all solutions."""
     P, total = problems(solver, 6, 300, **motion), 0
@@ -172,7 +196,8 @@ def real_yaws(f1, f2, tau1, tau2, gravity1, gravity2):
     eye, zero = np.eye(size), np.zeros((size, size))
     values = scipy.linalg.eigvals(
         np.block([[zero, eye], [-fixed - cosine, -2.0 * sine]]),
-        np.block([[eye, zero], [zero, fixed - cosine]]))
+        np.block([[eye, zero], [zero, fixed - cosine]]),
+    )
     # x = +-i is no angle: there Rz loses rank. A pair that rounding decides on is left out.
     values = values[np.isfinite(values) & (np.abs(values**2 + 1.0) > 1e-2)]
     yaws = 2.0 * np.arctan(values)
@@ -181,8 +206,9 @@ def real_yaws(f1, f2, tau1, tau2, gravity1, gravity2):
     return real[np.array(apart, dtype=bool)]
 
 
-@pytest.mark.parametrize(('off', 'reached', 'any_solution'), [
-    (0.01, 0.98, 0.98), (0.1, 0.75, 0.9), (1.0, 0.05, 0.6)])
+@pytest.mark.parametrize(
+    ('off', 'reached', 'any_solution'), [(0.01, 0.98, 0.98), (0.1, 0.75, 0.9), (1.0, 0.05, 0.6)]
+)
 def test_11_points_from_a_start_that_is_off(off, reached, any_solution):
     """At 10 m/s: from 0.01 deg all, from 0.1 deg most; farther, other solutions are nearer."""
     P = problems(uniform_11pt, 7, 100, speed=(10.0, 10.0))
@@ -198,14 +224,20 @@ def test_11_points_from_a_start_that_is_off(off, reached, any_solution):
 
 # --- noise
 
+
 @each_exact_case
 def test_error_is_proportional_to_small_noise(solver, motion):
     """With a bounded factor: a solver must not amplify rounding."""
     P = problems(solver, 9, 60, **motion)
     noise = np.random.default_rng(9).normal(size=(60, 2, POINTS[solver], 3))
-    medians = [np.radians(np.median([
-        nearest(solve(solver, P, k, noise=size * noise[k]), P.R[k])[1] for k in range(60)]))
-        for size in (1e-10, 1e-8)]
+    medians = [
+        np.radians(
+            np.median(
+                [nearest(solve(solver, P, k, noise=size * noise[k]), P.R[k])[1] for k in range(60)]
+            )
+        )
+        for size in (1e-10, 1e-8)
+    ]
     assert 30.0 < medians[1] / medians[0] < 300.0
     # Minimal 9- and 11-point problems amplify noise: by 1e2 to 1e4 in the median.
     assert medians[1] < (1e-4 if POINTS[solver] >= 9 else 1e-6)
@@ -213,9 +245,11 @@ def test_error_is_proportional_to_small_noise(solver, motion):
 
 # --- degenerate motion and readout
 
+
 @pytest.mark.parametrize('solver', [linear_9pt, uniform_9pt], ids=case_name)
-@pytest.mark.parametrize('motion', [{'constant_velocity': True}, STILL],
-                         ids=['constant velocity', 'at rest'])
+@pytest.mark.parametrize(
+    'motion', [{'constant_velocity': True}, STILL], ids=['constant velocity', 'at rest']
+)
 def test_9_points_find_the_rotation_if_the_velocities_are_not_observable(solver, motion):
     """The null space has dimension 3: R is a triple root, t and d an arbitrary mixture."""
     if solver is linear_9pt:
@@ -231,9 +265,15 @@ def test_a_global_shutter_has_no_velocities(solver, tau1, tau2):
     """Velocities are not observable from equal row times: no solution with 9 and 11 points."""
     P, n = problems(solver, 12, 5, speed=(0, 0), rate=(0, 0)), POINTS[solver]
     for k in range(5):
-        found = solver(P.rays1[k], P.rays2[k], np.full(n, tau1), np.full(n, tau2),
-                       gravity1=P.gravity1[k], gravity2=P.gravity2[k],
-                       start_rotations=P.R[k][None])
+        found = solver(
+            P.rays1[k],
+            P.rays2[k],
+            np.full(n, tau1),
+            np.full(n, tau2),
+            gravity1=P.gravity1[k],
+            gravity2=P.gravity2[k],
+            start_rotations=P.R[k][None],
+        )
         if n >= 9:
             assert found == []
         else:
@@ -242,31 +282,43 @@ def test_a_global_shutter_has_no_velocities(solver, tau1, tau2):
 
 # --- invariance
 
+
 @each_solver
 def test_solvers_are_pure_and_independent_of_lengths(solver):
     """Equal input, equal bits; arguments are not changed, lists are equivalent to arrays."""
     P = problems(solver, 13, 5, speed=(5, 5))
     for k in range(5):
         arguments = [*(f[k] for f in rays(solver, P)), P.tau1[k], P.tau2[k]]
-        known = {'gravity1': P.gravity1[k], 'gravity2': P.gravity2[k],
-                 'start_rotations': P.R[k][None]}
+        known = {
+            'gravity1': P.gravity1[k],
+            'gravity2': P.gravity2[k],
+            'start_rotations': P.R[k][None],
+        }
         before = copy.deepcopy([*arguments, *known.values()])
         first = solver(*arguments, **known)
-        for a, b, c in zip(first, solver(*arguments, **known), solver(
-                *(a.tolist() for a in arguments), **{n: v.tolist() for n, v in known.items()}),
-                strict=True):
+        for a, b, c in zip(
+            first,
+            solver(*arguments, **known),
+            solver(*(a.tolist() for a in arguments), **{n: v.tolist() for n, v in known.items()}),
+            strict=True,
+        ):
             assert np.array_equal(a.R, b.R) and np.array_equal(a.v1, b.v1)
             assert np.array_equal(a.t, c.t)
         assert all(map(np.array_equal, [*arguments, *known.values()], before))
         f1, f2, *times = arguments
-        scaled = solver(1e3 * f1, 1e-3 * f2, *times, **known | {
-            'gravity1': 9.81 * P.gravity1[k], 'gravity2': 1e-8 * P.gravity2[k]})
+        scaled = solver(
+            1e3 * f1,
+            1e-3 * f2,
+            *times,
+            **known | {'gravity1': 9.81 * P.gravity1[k], 'gravity2': 1e-8 * P.gravity2[k]},
+        )
         assert len(scaled) == len(first)
         for s in scaled:
             assert nearest(first, s.R)[1] < 1e-6
 
 
 # --- other code
+
 
 def essential_matrix(R, t):
     """Of ``x_2^T E x_1 = 0``, OpenCV's way, of length 1 and without a sign."""
@@ -286,11 +338,14 @@ def test_5_points_against_opencv():
     for k in range(300):
         x1, x2 = (np.ascontiguousarray(f[:, :2] / f[:, 2:]) for f in (P.rays1[k], P.rays2[k]))
         theirs, _ = cv2.findEssentialMat(x1, x2, np.eye(3))
-        theirs = theirs.reshape(-1, 3, 3) / np.linalg.norm(theirs.reshape(-1, 9), axis=1)[
-            :, None, None]
+        theirs = (
+            theirs.reshape(-1, 3, 3) / np.linalg.norm(theirs.reshape(-1, 9), axis=1)[:, None, None]
+        )
         ours = np.array([essential_matrix(s.R, s.t) for s in solve(global_5pt, P, k)])
-        gaps = np.minimum(np.abs(theirs[:, None] - ours).max(axis=(2, 3)),
-                          np.abs(theirs[:, None] + ours).max(axis=(2, 3)))
+        gaps = np.minimum(
+            np.abs(theirs[:, None] - ours).max(axis=(2, 3)),
+            np.abs(theirs[:, None] + ours).max(axis=(2, 3)),
+        )
         assert len(ours) == len(theirs)
         assert gaps.min(axis=0).max() < 0.01
         good = np.array([essential_residual(E) < 1e-10 for E in theirs])
@@ -301,11 +356,15 @@ def test_5_points_against_opencv():
 
 # --- the table
 
+
 @each_solver
 def test_table_functions_and_modes_of_the_estimator_agree(solver):
     row, mode = SOLVERS[solver.__name__], MODES[solver.__name__]
-    assert set(solvers.__all__) == {'MinimalSolution', *SOLVERS} == {
-        'MinimalSolution', *(function.__name__ for function in POINTS)}
+    assert (
+        set(solvers.__all__)
+        == {'MinimalSolution', *SOLVERS}
+        == {'MinimalSolution', *(function.__name__ for function in POINTS)}
+    )
     assert solver.__doc__.startswith(row.summary)
     assert row.sample_size == POINTS[solver]
     assert mode.solvers == (row,)

@@ -38,8 +38,9 @@ class WarpedScene:
     def similarity(self, degrees=0.0, scale=1.0, shift=(0.0, 0.0)):
         """Homography (image px -> plane px) of a turn about the image centre, zoom and shift."""
         height, width = self.shape
-        H = np.vstack([cv2.getRotationMatrix2D((width / 2, height / 2), -degrees, scale),
-                       [0.0, 0.0, 1.0]])
+        H = np.vstack(
+            [cv2.getRotationMatrix2D((width / 2, height / 2), -degrees, scale), [0.0, 0.0, 1.0]]
+        )
         H[:2, 2] += shift
         return H
 
@@ -47,8 +48,12 @@ class WarpedScene:
         """The image (H, W) of uint8 of the plane under H, with noise of the given sigma."""
         height, width = self.shape
         to_texture = np.array([[1.0, 0.0, MARGIN], [0.0, 1.0, MARGIN], [0.0, 0.0, 1.0]]) @ H
-        image = cv2.warpPerspective(self._texture, to_texture, (width, height),
-                                    flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+        image = cv2.warpPerspective(
+            self._texture,
+            to_texture,
+            (width, height),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        )
         image = gain * image.astype(np.float64) + offset
         image += noise * self._rng.normal(size=self.shape)
         return np.clip(np.round(image), 0, 255).astype(np.uint8)
@@ -89,8 +94,12 @@ def points():
 
 def window_at(image, centres, radius):
     """Windows (N, 2 radius + 1, 2 radius + 1) around pixels (N, 2)."""
-    return np.array([image[y - radius:y + radius + 1, x - radius:x + radius + 1].astype(int)
-                     for x, y in centres])
+    return np.array(
+        [
+            image[y - radius : y + radius + 1, x - radius : x + radius + 1].astype(int)
+            for x, y in centres
+        ]
+    )
 
 
 # With a level more a point may be twice as far from its guess.
@@ -131,9 +140,13 @@ def test_warped_patches_are_those_of_the_warped_image(images, points):
     H = np.array([[1.02, 0.05, -3.0], [-0.04, 0.98, 6.0], [2e-5, -1e-5, 1.0]])
     image, radius = images[0], 11
     height, width = image.shape
-    warped = cv2.warpPerspective(image, H, (width, height),
-                                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                                 borderMode=cv2.BORDER_REPLICATE)
+    warped = cv2.warpPerspective(
+        image,
+        H,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     origins = cv2.perspectiveTransform(points[:, None], H)[:, 0]
     jacobians = klt.window_jacobians(points, origins)
     step = 1e-4
@@ -141,17 +154,21 @@ def test_warped_patches_are_those_of_the_warped_image(images, points):
         moved = points + step * np.eye(2)[axis]
         np.testing.assert_allclose(
             jacobians[:, :, axis],
-            (cv2.perspectiveTransform(moved[:, None], H)[:, 0] - origins) / step, atol=1e-5)
+            (cv2.perspectiveTransform(moved[:, None], H)[:, 0] - origins) / step,
+            atol=1e-5,
+        )
     patches = windows.cut_warped(image, origins, jacobians, radius, points)
     expected = cut(warped, points, radius)
     np.testing.assert_array_equal(patches.shifts, expected.shifts)
     centres = np.rint(points + patches.shifts).astype(int)
     difference = window_at(patches.image, centres, radius) - window_at(
-        expected.image, centres, radius)
+        expected.image, centres, radius
+    )
     assert np.percentile(np.abs(difference), 99) <= 3 and np.median(np.abs(difference)) <= 1
 
 
 # -- corners
+
 
 def hand_held(scene, k):
     """Homography of frame k: turns by 1.2 deg, zooms by 1 %, and shifts in each frame."""
@@ -174,26 +191,32 @@ def track_sequence(images, **settings):
 
 # Of each view turn [deg], zoom, shift [px] and brightness; matches, and largest errors [px] of the
 # median and of 95 %.
-@pytest.mark.parametrize(('views', 'noise', 'least', 'median', 'most'), [
-    ([(4.0, 1.03, (6.3, -4.8))], 0.0, 250, 0.05, 0.15),
-    ([(0.0,)] * 3, 0.0, 290, 1e-3, 1e-3),
-    # The window's exposure changes.
-    ([(1.0, 1.0, (3.4, 1.7), 0.7, 25.0)], 3.0, 230, 0.1, 1.0),
-    # Turned windows are compared upright.
-    ([(5.0 * k, 1.0 + 0.03 * k) for k in range(1, 6)], 0.0, 150, 0.1, 1.0),
-    # A jerk after steady motion: less of the pyramid is used where guesses were good.
-    ([(0.0, 1.0, (x, 0.0)) for x in (1.0, 2.0, 3.0, 4.0, 22.0, 23.0)], 0.0, 240, 0.1, 1.0),
-], ids=['warp', 'frozen image', 'exposure', 'turned windows', 'jerk'])
+@pytest.mark.parametrize(
+    ('views', 'noise', 'least', 'median', 'most'),
+    [
+        ([(4.0, 1.03, (6.3, -4.8))], 0.0, 250, 0.05, 0.15),
+        ([(0.0,)] * 3, 0.0, 290, 1e-3, 1e-3),
+        # The window's exposure changes.
+        ([(1.0, 1.0, (3.4, 1.7), 0.7, 25.0)], 3.0, 230, 0.1, 1.0),
+        # Turned windows are compared upright.
+        ([(5.0 * k, 1.0 + 0.03 * k) for k in range(1, 6)], 0.0, 150, 0.1, 1.0),
+        # A jerk after steady motion: less of the pyramid is used where guesses were good.
+        ([(0.0, 1.0, (x, 0.0)) for x in (1.0, 2.0, 3.0, 4.0, 22.0, 23.0)], 0.0, 240, 0.1, 1.0),
+    ],
+    ids=['warp', 'frozen image', 'exposure', 'turned windows', 'jerk'],
+)
 def test_matches_of_warps(scene, views, noise, least, median, most):
     H = [scene.similarity(*view[:3]) for view in views]
-    images = [scene.view(noise=noise), *(
-        scene.view(warp, noise, *view[3:]) for warp, view in zip(H, views, strict=True))]
+    images = [
+        scene.view(noise=noise),
+        *(scene.view(warp, noise, *view[3:]) for warp, view in zip(H, views, strict=True)),
+    ]
     matches = track_sequence(images).refined_matches()
     error = errors(matches, ONE, H[-1])
     assert len(error) > least
     assert np.median(error) < median
     assert np.percentile(error, 95) < most
-    if len(views) == 5:   # the same windows, not turned, hardly look alike
+    if len(views) == 5:  # the same windows, not turned, hardly look alike
         plain = correlations(images[0], images[5], matches.points1, matches.points2, 15)
         assert np.median(plain) < np.median(matches.quality) - 0.1
 
@@ -223,7 +246,7 @@ def test_prediction_bridges_60_px(scene, levels):
     matches = tracker.track(scene.view(H2), expected)
     assert len(matches) > 180
     assert np.median(errors(matches, ONE, H2)) < 0.15
-    if levels == 1:   # not without a prediction
+    if levels == 1:  # not without a prediction
         tracker = track_sequence([scene.view(), scene.view(H2)], klt_levels=1)
         assert np.sum(errors(tracker.refined_matches(), ONE, H2) < 1.0) < 20
 
@@ -266,8 +289,9 @@ def test_ids_are_unique_and_persist_over_pairs(scene, detector, least):
     for pair in pairs:
         assert pair.track_ids.dtype == np.uint32
         assert len(np.unique(pair.track_ids)) == len(pair)
-    common, in_first, in_second = np.intersect1d(first.track_ids, second.track_ids,
-                                                 return_indices=True)
+    common, in_first, in_second = np.intersect1d(
+        first.track_ids, second.track_ids, return_indices=True
+    )
     assert len(common) > least
     # The same track: the second point of one pair is the first point of the next.
     np.testing.assert_array_equal(first.points2[in_first], second.points1[in_second])
@@ -295,14 +319,16 @@ def test_corners_are_spread_and_keep_their_distance(scene):
     image = scene.view()
     # A half with contrast four times that of the other one must not take all corners.
     image[:, 320:] = 128 + (image[:, 320:].astype(int) - 128) // 4
-    points = started(image, max_features=200, min_feature_distance=12.0,
-                     feature_quality=0.5).points
+    points = started(
+        image, max_features=200, min_feature_distance=12.0, feature_quality=0.5
+    ).points
     assert len(points) > 190
     assert 0.35 < np.mean(points[:, 0] < 320) < 0.65
     apart = np.linalg.norm(points[:, None] - points[None], axis=2) + 1e9 * np.eye(len(points))
     assert apart.min() >= 12.0 - 1e-9
-    cells, _, _ = np.histogram2d(points[:, 1], points[:, 0], bins=(4, 5),
-                                 range=((0, 480), (0, 640)))
+    cells, _, _ = np.histogram2d(
+        points[:, 1], points[:, 0], bins=(4, 5), range=((0, 480), (0, 640))
+    )
     assert cells.min() >= 3
 
 
@@ -326,13 +352,16 @@ def test_images_that_share_nothing_have_few_matches(scene, detector, most):
     assert len(tracker.refined_matches()) < most
     assert tracker.tracked_fraction < 0.1
     rng = np.random.default_rng(5)
-    grey = [np.clip(np.round(120 + 2.0 * rng.normal(size=(480, 640))), 0, 255).astype(np.uint8)
-            for _ in range(2)]
+    grey = [
+        np.clip(np.round(120 + 2.0 * rng.normal(size=(480, 640))), 0, 255).astype(np.uint8)
+        for _ in range(2)
+    ]
     assert detector != 'klt' or len(track_sequence(grey).refined_matches()) < 10
 
 
-@pytest.mark.parametrize(('detector', 'value'), [
-    ('klt', 0), ('klt', 255), ('sift', 0), ('orb', 0)])
+@pytest.mark.parametrize(
+    ('detector', 'value'), [('klt', 0), ('klt', 255), ('sift', 0), ('orb', 0)]
+)
 def test_blank_frames_lose_all_tracks_and_good_ones_bring_new(scene, detector, value):
     good, blank = scene.view(), np.full((480, 640), value, dtype=np.uint8)
     tracker = started(good, detector=detector)
@@ -365,8 +394,11 @@ def test_what_is_no_image_of_the_stream_is_refused(scene, detector):
     with pytest.raises(InputError, match='start'):
         tracker.promote()
     tracker.start(image)
-    for bad, message in ((image[:, :600], '640x480 to 600x480'),
-                         (image.astype(np.float32), 'uint8'), (image[:0], 'not empty')):
+    for bad, message in (
+        (image[:, :600], '640x480 to 600x480'),
+        (image.astype(np.float32), 'uint8'),
+        (image[:0], 'not empty'),
+    ):
         for call in (tracker.track, tracker.start):
             with pytest.raises(InputError, match=message):
                 call(bad)
@@ -381,8 +413,9 @@ def test_quality_ranks_matches_by_their_errors(scene):
     halves = []
     for k in range(4):
         H2 = scene.similarity(1.0, 1.0, (3.4, 1.7 + 0.1 * k))
-        matches = track_sequence([scene.view(noise=12.0), scene.view(H2, noise=12.0)],
-                                 min_correlation=0.3).refined_matches()
+        matches = track_sequence(
+            [scene.view(noise=12.0), scene.view(H2, noise=12.0)], min_correlation=0.3
+        ).refined_matches()
         assert (matches.quality >= 0.0).all() and (matches.quality <= 1.0).all()
         error = errors(matches, ONE, H2)[np.argsort(-matches.quality)]
         assert len(error) > 200
@@ -421,10 +454,14 @@ def test_correlation_equals_that_of_numpy(scene, side):
     steps = np.arange(side) - side // 2
     grid = np.stack(np.meshgrid(steps, steps, indexing='ij'), axis=-1)
     for row, point1, point2 in zip(
-            correlations(*images, points1, points2, side), points1, points2, strict=True):
-        windows = [map_coordinates(image.astype(float), (grid + point[::-1]).reshape(-1, 2).T,
-                                   order=1, mode='nearest')
-                   for image, point in zip(images, (point1, point2), strict=True)]
+        correlations(*images, points1, points2, side), points1, points2, strict=True
+    ):
+        windows = [
+            map_coordinates(
+                image.astype(float), (grid + point[::-1]).reshape(-1, 2).T, order=1, mode='nearest'
+            )
+            for image, point in zip(images, (point1, point2), strict=True)
+        ]
         if min(window.std() for window in windows) > 0.1:
             assert row == pytest.approx(np.corrcoef(*windows)[0, 1], abs=1e-4)
     flat = np.full_like(images[0], 7)
@@ -436,14 +473,18 @@ def test_homography_of_windows_is_the_identity_where_there_is_none():
     points = rng.uniform(0.0, 480.0, (50, 2))
     line = np.column_stack([points[:, 0], 100.0 + 0.0 * points[:, 0]])
     # Too few points, no homography at all, and one that stretches too much.
-    for first, second in ((points[:5], points[:5] + 3.0), (points, points[::-1]),
-                          (points, 10.0 * points)):
+    for first, second in (
+        (points[:5], points[:5] + 3.0),
+        (points, points[::-1]),
+        (points, 10.0 * points),
+    ):
         np.testing.assert_array_equal(klt.window_homography(first, second), ONE)
     # Points on a line leave it open; what is found must agree with them.
     H = klt.window_homography(line, line)
     np.testing.assert_allclose(cv2.perspectiveTransform(line[:, None], H)[:, 0], line, atol=1e-6)
-    np.testing.assert_allclose(klt.window_homography(points, points + 3.0),
-                               [[1, 0, 3], [0, 1, 3], [0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(
+        klt.window_homography(points, points + 3.0), [[1, 0, 3], [0, 1, 3], [0, 0, 1]], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize('values', [{'klt_window': 14}, {'feature_rows': (300, 100)}])
@@ -453,6 +494,7 @@ def test_illegal_settings_are_refused(values):
 
 
 # -- SIFT and ORB over wide baselines
+
 
 @pytest.mark.parametrize('detector, exact', [('sift', 0.5), ('orb', 1.5)])
 def test_wide_baseline(scene, detector, exact):
@@ -471,19 +513,26 @@ def test_wide_baseline(scene, detector, exact):
 
 
 def test_mutual_nearest_neighbours_and_ratio_agree_with_the_brute_force_matcher(scene):
-    images = [scene.view(noise=2.0),
-              scene.view(scene.similarity(20.0, 1.1, (20.0, 5.0)), noise=2.0)]
-    matches = track_sequence(images, detector='sift', match_ratio=0.7,
-                             max_descriptors=600).refined_matches()
+    images = [
+        scene.view(noise=2.0),
+        scene.view(scene.similarity(20.0, 1.1, (20.0, 5.0)), noise=2.0),
+    ]
+    matches = track_sequence(
+        images, detector='sift', match_ratio=0.7, max_descriptors=600
+    ).refined_matches()
     sift = cv2.SIFT.create(nfeatures=600)
     # One descriptor per place, as the tracker keeps them.
     (k1, d1), (k2, d2) = (once(*sift.detectAndCompute(image, None)) for image in images)
     back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher().match(d2, d1)}
-    expected = {(k1[a.queryIdx].pt, k2[a.trainIdx].pt)
-                for a, b in cv2.BFMatcher().knnMatch(d1, d2, k=2)
-                if a.distance < 0.7 * b.distance and back[a.trainIdx] == a.queryIdx}
-    found = {(tuple(p), tuple(q))
-             for p, q in zip(matches.points1.tolist(), matches.points2.tolist(), strict=True)}
+    expected = {
+        (k1[a.queryIdx].pt, k2[a.trainIdx].pt)
+        for a, b in cv2.BFMatcher().knnMatch(d1, d2, k=2)
+        if a.distance < 0.7 * b.distance and back[a.trainIdx] == a.queryIdx
+    }
+    found = {
+        (tuple(p), tuple(q))
+        for p, q in zip(matches.points1.tolist(), matches.points2.tolist(), strict=True)
+    }
     assert len(expected) > 50
     assert found == expected
 

@@ -17,20 +17,66 @@ GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
 DOWN = np.array([0.0, 1.0, 0.0])
 
 # Matches in pixels, measurements of the IMU, and the truth (velocities in baselines/s).
-TwoViewScene = make_dataclass('TwoViewScene', (
-    'points1', 'points2', 'measured_rate1', 'measured_rate2', 'measured_gravity1',
-    'measured_gravity2', 'R', 't', 'v1', 'v2', 'w1', 'w2', 'is_outlier'), frozen=True)
+TwoViewScene = make_dataclass(
+    'TwoViewScene',
+    (
+        'points1',
+        'points2',
+        'measured_rate1',
+        'measured_rate2',
+        'measured_gravity1',
+        'measured_gravity2',
+        'R',
+        't',
+        'v1',
+        'v2',
+        'w1',
+        'w2',
+        'is_outlier',
+    ),
+    frozen=True,
+)
 # K problems of n exact matches each; the truth in their own units (|t| = 1). `rays*` (K, n, 3) as
 # measured; `derotated*` the same in the camera's orientation at tau 0; row times `tau*` (K, n);
 # `gravity*`, `t`, `v*`, `w*` (K, 3); `R` (K, 3, 3).
-MinimalProblems = make_dataclass('MinimalProblems', (
-    'rays1', 'rays2', 'derotated1', 'derotated2', 'tau1', 'tau2', 'gravity1', 'gravity2', 'R', 't',
-    'v1', 'v2', 'w1', 'w2'), frozen=True)
+MinimalProblems = make_dataclass(
+    'MinimalProblems',
+    (
+        'rays1',
+        'rays2',
+        'derotated1',
+        'derotated2',
+        'tau1',
+        'tau2',
+        'gravity1',
+        'gravity2',
+        'R',
+        't',
+        'v1',
+        'v2',
+        'w1',
+        'w2',
+    ),
+    frozen=True,
+)
 
 
-def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_noise=0.5,
-               gravity_noise=GRAVITY_NOISE, gyro_noise=GYRO_NOISE, outliers=0.3,
-               constant_velocity=False, pure_rotation=False, on_a_line=False, reference='first'):
+def make_scene(
+    seed,
+    *,
+    n=300,
+    direction='forward',
+    speed=1.0,
+    rate=1.0,
+    pixel_noise=0.5,
+    gravity_noise=GRAVITY_NOISE,
+    gyro_noise=GYRO_NOISE,
+    outliers=0.3,
+    constant_velocity=False,
+    pure_rotation=False,
+    on_a_line=False,
+    reference='first',
+):
     """Draw one problem.
 
     `speed` [m/s] and `rate` [rad/s] are per axis; `gravity_noise` [rad] per axis and opposite in
@@ -38,8 +84,10 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
     `reference` the row that pose and motion refer to.
     """
     rng = np.random.default_rng(seed)
-    view = replace(VIEW, reference_row={
-        'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference])
+    view = replace(
+        VIEW,
+        reference_row={'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference],
+    )
     p2 = BASELINES[direction] + rng.normal(size=3) * 0.2
     if pure_rotation:
         p2, speed = np.zeros(3), 0.0
@@ -58,20 +106,36 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
             return ends[0] + rng.uniform(size=(8 * n, 1)) * (ends[1] - ends[0])
         return rng.uniform([-30, -18, 6], [30, 18, 34], (8 * n, 3))
 
-    exact = in_both_views(candidates, uniform_motion(R1, np.zeros(3), w1, v1),
-                          uniform_motion(R2, p2, w2, v2), view, n)
+    exact = in_both_views(
+        candidates,
+        uniform_motion(R1, np.zeros(3), w1, v1),
+        uniform_motion(R2, p2, w2, v2),
+        view,
+        n,
+    )
     points1, points2, is_outlier = measured(exact, view, pixel_noise, outliers, rng)
     length = np.linalg.norm(p2) if not pure_rotation else 1.0
     tilt = Rotation.from_rotvec(gravity_noise * rng.choice([-1.0, 1.0], 3))
     return TwoViewScene(
-        points1, points2, w1 + rng.normal(size=3) * gyro_noise,
-        w2 + rng.normal(size=3) * gyro_noise, tilt.apply(R1.inv().apply(DOWN)),
-        tilt.inv().apply(R2.inv().apply(DOWN)), (R1.inv() * R2).as_matrix(),
-        R1.inv().apply(p2) / length, v1 / length, v2 / length, w1, w2, is_outlier)
+        points1,
+        points2,
+        w1 + rng.normal(size=3) * gyro_noise,
+        w2 + rng.normal(size=3) * gyro_noise,
+        tilt.apply(R1.inv().apply(DOWN)),
+        tilt.inv().apply(R2.inv().apply(DOWN)),
+        (R1.inv() * R2).as_matrix(),
+        R1.inv().apply(p2) / length,
+        v1 / length,
+        v2 / length,
+        w1,
+        w2,
+        is_outlier,
+    )
 
 
-def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
-                          constant_velocity=False, turned=False):
+def make_minimal_problems(
+    seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0), constant_velocity=False, turned=False
+):
     """Draw problems of the same set-up, half of them forward and half sideways, without noise.
 
     `speed` [m/s] and `rate` [rad/s] are ranges of what each axis has. Row times count from the
@@ -82,10 +146,14 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
     rng = np.random.default_rng(seed)
     p2 = np.where(np.arange(count)[:, None] % 2, BASELINES['sideways'], BASELINES['forward'])
     p2 = p2 + rng.normal(size=(count, 3)) * 0.2
-    R1, R2 = (Rotation.from_euler('xyz', rng.uniform(-10, 10, (count, 3)), degrees=True)
-              for _ in range(2))
-    v1, w1 = (rng.uniform(*size, (count, 1)) * rng.choice([-1.0, 1.0], (count, 3))
-              for size in (speed, rate))
+    R1, R2 = (
+        Rotation.from_euler('xyz', rng.uniform(-10, 10, (count, 3)), degrees=True)
+        for _ in range(2)
+    )
+    v1, w1 = (
+        rng.uniform(*size, (count, 1)) * rng.choice([-1.0, 1.0], (count, 3))
+        for size in (speed, rate)
+    )
     v2, w2 = -v1, -w1
     length = np.linalg.norm(p2, axis=1, keepdims=True)
     if constant_velocity:
@@ -100,7 +168,8 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
         a, tau = VIEW.unproject(pixels), pixels[:, 1] * LINE_DELAY
         turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
         world = turn.apply(rng.uniform(6, 34, (len(k), 1)) * a) + (
-            tau[:, None] * R1[k].apply(v1[k]))
+            tau[:, None] * R1[k].apply(v1[k])
+        )
         second, rows = uniform_motion(R2[k], p2[k], w2[k], v2[k]), np.full(len(k), HEIGHT / 2)
         for _ in range(15):
             later = rows * LINE_DELAY
@@ -112,17 +181,31 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
         rays1[found], tau1[found] = a[observed], tau[observed]
         rays2[found], tau2[found] = b[observed], later[observed]
         missing = missing[~observed]
-    Q1, Q2 = (Rotation.random(count, random_state=rng) if turned else Rotation.identity(count)
-              for _ in range(2))
-    derotated = [Rotation.from_rotvec(tau[:, None] * w[owner]).apply(rays)
-                 for tau, w, rays in ((tau1, w1, rays1), (tau2, w2, rays2))]
-    rays = [Q[owner].apply(f).reshape(count, n, 3) / np.linalg.norm(f, axis=1).reshape(count, n, 1)
-            for Q, f in zip((Q1, Q2, Q1, Q2), (rays1, rays2, *derotated), strict=True)]
+    Q1, Q2 = (
+        Rotation.random(count, random_state=rng) if turned else Rotation.identity(count)
+        for _ in range(2)
+    )
+    derotated = [
+        Rotation.from_rotvec(tau[:, None] * w[owner]).apply(rays)
+        for tau, w, rays in ((tau1, w1, rays1), (tau2, w2, rays2))
+    ]
+    rays = [
+        Q[owner].apply(f).reshape(count, n, 3) / np.linalg.norm(f, axis=1).reshape(count, n, 1)
+        for Q, f in zip((Q1, Q2, Q1, Q2), (rays1, rays2, *derotated), strict=True)
+    ]
     return MinimalProblems(
-        *rays, tau1.reshape(count, n), tau2.reshape(count, n), (Q1 * R1.inv()).apply(DOWN),
-        (Q2 * R2.inv()).apply(DOWN), (Q1 * R1.inv() * R2 * Q2.inv()).as_matrix(),
-        (Q1 * R1.inv()).apply(p2 / length), Q1.apply(v1 / length), Q2.apply(v2 / length),
-        Q1.apply(w1), Q2.apply(w2))
+        *rays,
+        tau1.reshape(count, n),
+        tau2.reshape(count, n),
+        (Q1 * R1.inv()).apply(DOWN),
+        (Q2 * R2.inv()).apply(DOWN),
+        (Q1 * R1.inv() * R2 * Q2.inv()).as_matrix(),
+        (Q1 * R1.inv()).apply(p2 / length),
+        Q1.apply(v1 / length),
+        Q2.apply(v2 / length),
+        Q1.apply(w1),
+        Q2.apply(w2),
+    )
 
 
 def rotation_error(R, truth):

@@ -23,7 +23,8 @@ class PathNode(Node):
         self.path, self.publisher = Path(), self.create_publisher(Path, '~/path', 10)
         for topic, kind in PAIR_TOPICS.items():
             self.create_subscription(
-                message_class(kind), topic, lambda m, topic=topic: self.receive(topic, m), 10)
+                message_class(kind), topic, lambda m, topic=topic: self.receive(topic, m), 10
+            )
 
     def receive(self, topic, message):
         """Extend the path where the message completes a pair."""
@@ -38,7 +39,8 @@ class PathNode(Node):
             return
         self.path.poses += [
             pose_stamped_message(pose.stamp_ns, 'path', pose.R, pose.position, message_class)
-            for pose in step.poses]
+            for pose in step.poses
+        ]
         self.path.header = self.path.poses[-1].header
         self.publisher.publish(self.path)
 

@@ -24,9 +24,17 @@ def main(bag, parameter_file, *stamps):
     # node. The buffer must still cover the first image when its view is created.
     parameters = read_parameters(Path(parameter_file), ['imu_buffer_seconds=60'])
     intrinsics = Intrinsics(
-        width=info.width, height=info.height, image_width=info.width, image_height=info.height,
-        fx=info.k[0], fy=info.k[4], cx=info.k[2], cy=info.k[5],
-        distortion_model=info.distortion_model, distortion=tuple(info.d))
+        width=info.width,
+        height=info.height,
+        image_width=info.width,
+        image_height=info.height,
+        fx=info.k[0],
+        fy=info.k[4],
+        cx=info.k[2],
+        cy=info.k[5],
+        distortion_model=info.distortion_model,
+        distortion=tuple(info.d),
+    )
     imu = ImuBuffer(parameters.imu)
     for sample in samples:
         imu.add(sample)

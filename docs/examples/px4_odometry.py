@@ -23,8 +23,9 @@ def px4_fields(odometry):
     stamp, pose, twist = odometry.header.stamp, odometry.pose.pose, odometry.twist.twist
     q = pose.orientation
     R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    of_pose, of_twist = (np.reshape(part.covariance, (6, 6))
-                         for part in (odometry.pose, odometry.twist))
+    of_pose, of_twist = (
+        np.reshape(part.covariance, (6, 6)) for part in (odometry.pose, odometry.twist)
+    )
     values = {
         'position': SIGNS * [getattr(pose.position, axis) for axis in 'xyz'],
         'q': [q.w, q.x, -q.y, -q.z],
@@ -32,9 +33,12 @@ def px4_fields(odometry):
         'angular_velocity': SIGNS * [getattr(twist.angular, axis) for axis in 'xyz'],
         'position_variance': np.diag(of_pose)[:3],
         'orientation_variance': np.diag(R.T @ of_pose[3:, 3:] @ R),
-        'velocity_variance': np.diag(of_twist)[:3]}
-    return {'timestamp_sample': stamp.sec * 10**6 + stamp.nanosec // 1000,
-            **{name: np.float32(value) for name, value in values.items()}}
+        'velocity_variance': np.diag(of_twist)[:3],
+    }
+    return {
+        'timestamp_sample': stamp.sec * 10**6 + stamp.nanosec // 1000,
+        **{name: np.float32(value) for name, value in values.items()},
+    }
 
 
 class Px4Node(Node):
@@ -44,9 +48,11 @@ class Px4Node(Node):
         super().__init__('px4_odometry')
         self.last, self.resets = None, 0
         from px4_msgs.msg import VehicleOdometry
+
         self.kind = VehicleOdometry
         self.publisher = self.create_publisher(
-            VehicleOdometry, '/fmu/in/vehicle_visual_odometry', qos_profile_sensor_data)
+            VehicleOdometry, '/fmu/in/vehicle_visual_odometry', qos_profile_sensor_data
+        )
         self.create_subscription(Odometry, 'odometry', self.receive, 10)
 
     def receive(self, odometry):
@@ -54,10 +60,15 @@ class Px4Node(Node):
         fields = px4_fields(odometry)
         last, self.last = self.last, fields['timestamp_sample']
         self.resets += last is not None and not 0 < self.last - last < PAUSE
-        self.publisher.publish(self.kind(
-            timestamp=self.get_clock().now().nanoseconds // 1000,
-            pose_frame=self.kind.POSE_FRAME_FRD, velocity_frame=self.kind.VELOCITY_FRAME_BODY_FRD,
-            reset_counter=self.resets % 256, **fields))
+        self.publisher.publish(
+            self.kind(
+                timestamp=self.get_clock().now().nanoseconds // 1000,
+                pose_frame=self.kind.POSE_FRAME_FRD,
+                velocity_frame=self.kind.VELOCITY_FRAME_BODY_FRD,
+                reset_counter=self.resets % 256,
+                **fields,
+            )
+        )
 
 
 if __name__ == '__main__':

@@ -14,8 +14,10 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.settings import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
-HELP = ('Measure the package: the estimator on simulated frame pairs, the live node, the '
-        'calibration. Writes tables (CSV, Markdown) into a folder.')
+HELP = (
+    'Measure the package: the estimator on simulated frame pairs, the live node, the '
+    'calibration. Writes tables (CSV, Markdown) into a folder.'
+)
 
 _Run = Callable[[argparse.Namespace], int]
 
@@ -41,9 +43,11 @@ BENCHMARKS: dict[str, Benchmark] = {}
 
 def _benchmark(name: str, text: str, *arguments: Argument) -> Callable[[_Run], _Run]:
     """Add a function to the benchmarks."""
+
     def add(run: _Run) -> _Run:
         BENCHMARKS[name] = Benchmark(text, arguments, run)
         return run
+
     return add
 
 
@@ -54,8 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         one = benchmarks.add_parser(name, help=benchmark.help, description=benchmark.help)
         for argument in benchmark.arguments:
             one.add_argument(argument.name, **argument.keywords)
-        one.add_argument('--output', type=Path, default=Path('out', name.replace('-', '_')),
-                         metavar='DIR', help='folder of the tables (default: %(default)s)')
+        one.add_argument(
+            '--output',
+            type=Path,
+            default=Path('out', name.replace('-', '_')),
+            metavar='DIR',
+            help='folder of the tables (default: %(default)s)',
+        )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,9 +96,13 @@ def _print_report(report: str, folder: Path) -> int:
     return 0
 
 
-def _report_of(items: Sequence[Any], work: Callable[[Any], Any],
-               report: Callable[[Path, list[Any]], str], args: argparse.Namespace,
-               unit: str) -> int:
+def _report_of(
+    items: Sequence[Any],
+    work: Callable[[Any], Any],
+    report: Callable[[Path, list[Any]], str],
+    args: argparse.Namespace,
+    unit: str,
+) -> int:
     """Work on each item, and report all results so far: an interrupted run leaves a report.
 
     A list that `work` returns is several results.
@@ -109,16 +122,31 @@ def _report_of(items: Sequence[Any], work: Callable[[Any], Any],
 
 # -- arguments of several benchmarks ----------------------------------------------------------
 
+
 def _number(option: str, default: float, text: str, low: float = 0, metavar: str = '') -> Argument:
     """A whole number (N) or seconds (S), as its default, if no other unit is given."""
-    return Argument(option, {
-        'type': type(default), 'default': default, 'help': f'{text} (default: %(default)s)',
-        'metavar': metavar or ('N' if isinstance(default, int) else 'S')}, low)
+    return Argument(
+        option,
+        {
+            'type': type(default),
+            'default': default,
+            'help': f'{text} (default: %(default)s)',
+            'metavar': metavar or ('N' if isinstance(default, int) else 'S'),
+        },
+        low,
+    )
 
 
 def _cells(default: Sequence[str], text: str) -> Argument:
-    return Argument('--cells', {'nargs': '+', 'default': default, 'metavar': 'NAME', 'help':
-                                f'cells by name, with * as in file names; {text}'})
+    return Argument(
+        '--cells',
+        {
+            'nargs': '+',
+            'default': default,
+            'metavar': 'NAME',
+            'help': f'cells by name, with * as in file names; {text}',
+        },
+    )
 
 
 def _seed(first: int, of: str) -> Argument:
@@ -141,8 +169,10 @@ def _need_ros() -> None:
     try:
         import_module('rs_relpose_lab.live.live_run')
     except ImportError as error:
-        raise MissingInputError(f'the live benchmark needs ROS 2 (rclpy, Fast DDS): {error}; '
-                                'source its setup.bash, or use the environment of make') from error
+        raise MissingInputError(
+            f'the live benchmark needs ROS 2 (rclpy, Fast DDS): {error}; '
+            'source its setup.bash, or use the environment of make'
+        ) from error
 
 
 def _shipped(name: str) -> Path:
@@ -157,34 +187,59 @@ def _shipped(name: str) -> Path:
 
 # -- the benchmarks ---------------------------------------------------------------------------
 
+
 @_benchmark(
     'accuracy',
     'errors, normalised errors and lost poses against an oracle, over many random problems',
     _number('--trials', 200, 'problems a cell', low=1),
     _cells(['all'], 'e.g. "forward-*" (default: all)'),
-    Argument('--noise', {
-        'nargs': '+', 'choices': ('paper', 'gaussian'), 'default': ['paper', 'gaussian'],
-        'help': 'error of gravity: of fixed size and opposite in the frames, as in the paper '
-                '(accuracy), or Gaussian in each frame (covariance) (default: both)'}),
-    Argument('--sigma-factor', {
-        'nargs': '+', 'type': float, 'default': [1.0], 'metavar': 'X',
-        'help': 'configured sigmas of the estimator by the true ones (default: 1)'}),
-    Argument('--solver', {'choices': SOLVER_CHOICES, 'default': 'auto',
-                          'help': '(default: auto)'}),
+    Argument(
+        '--noise',
+        {
+            'nargs': '+',
+            'choices': ('paper', 'gaussian'),
+            'default': ['paper', 'gaussian'],
+            'help': 'error of gravity: of fixed size and opposite in the frames, as in the paper '
+            '(accuracy), or Gaussian in each frame (covariance) (default: both)',
+        },
+    ),
+    Argument(
+        '--sigma-factor',
+        {
+            'nargs': '+',
+            'type': float,
+            'default': [1.0],
+            'metavar': 'X',
+            'help': 'configured sigmas of the estimator by the true ones (default: 1)',
+        },
+    ),
+    Argument(
+        '--solver', {'choices': SOLVER_CHOICES, 'default': 'auto', 'help': '(default: auto)'}
+    ),
     _paths('--cache', 'DIR', "folder that keeps the oracle's results (default: OUTPUT/oracle)"),
-    _seed(0, 'problem of a cell'), _number(
-        '--jobs', 1, 'processes; times are comparable only where each has its own core', low=1))
+    _seed(0, 'problem of a cell'),
+    _number(
+        '--jobs', 1, 'processes; times are comparable only where each has its own core', low=1
+    ),
+)
 def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import accuracy
     from rs_relpose_lab.experiments.problems import CELLS
+
     if min(args.sigma_factor) <= 0.0:
         raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
     chosen = accuracy.AccuracyRun(
-        matching_cells(args.cells, CELLS), tuple(dict.fromkeys(args.noise)),
-        tuple(dict.fromkeys(args.sigma_factor)), args.trials, args.seed, args.solver)
+        matching_cells(args.cells, CELLS),
+        tuple(dict.fromkeys(args.noise)),
+        tuple(dict.fromkeys(args.sigma_factor)),
+        args.trials,
+        args.seed,
+        args.solver,
+    )
     with progress_bar(chosen.estimates, 'estimate') as bar:
         trials = accuracy.run_accuracy(
-            chosen, args.cache or args.output / 'oracle', args.jobs, bar.update)
+            chosen, args.cache or args.output / 'oracle', args.jobs, bar.update
+        )
     return _print_report(accuracy.write_report(args.output, chosen, trials), args.output)
 
 
@@ -193,23 +248,41 @@ def _run_accuracy(args: argparse.Namespace) -> int:
     'time and errors of this library, OpenCV (USAC_MAGSAC) and PoseLib on the same problems, and '
     'growth of time with matches',
     _number('--trials', 50, 'problems a cell', low=1),
-    _cells(['*-base', '*-v0-w0', '*-outliers-60'],
-           'default: the base cells, cameras at rest, 60 %% outliers'),
-    Argument('--matches', {
-        'nargs': '+', 'type': int, 'default': [300, 1000, 3000, 10000], 'metavar': 'N',
-        'help': 'numbers of matches over which time is shown (default: 300 1000 3000 10000)'}, 50),
-    _seed(0, 'problem'))
+    _cells(
+        ['*-base', '*-v0-w0', '*-outliers-60'],
+        'default: the base cells, cameras at rest, 60 %% outliers',
+    ),
+    Argument(
+        '--matches',
+        {
+            'nargs': '+',
+            'type': int,
+            'default': [300, 1000, 3000, 10000],
+            'metavar': 'N',
+            'help': 'numbers of matches over which time is shown (default: 300 1000 3000 10000)',
+        },
+        50,
+    ),
+    _seed(0, 'problem'),
+)
 def _run_speed(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import speed
     from rs_relpose_lab.experiments.problems import Cell, CELLS
+
     cells = matching_cells(args.cells, CELLS)
     # Large problems need fewer: their times scatter less.
     few = max(args.trials // 5, 1)
     with progress_bar(len(cells) * args.trials + len(args.matches) * few, 'problem') as bar:
-        comparison = [timing for cell in cells for timing in speed.compare(
-            cell, Cell().matches, args.trials, args.seed, bar.update)]
-        scaling = [timing for count in sorted(set(args.matches)) for timing in speed.compare(
-            cells[0], count, few, args.seed, bar.update)]
+        comparison = [
+            timing
+            for cell in cells
+            for timing in speed.compare(cell, Cell().matches, args.trials, args.seed, bar.update)
+        ]
+        scaling = [
+            timing
+            for count in sorted(set(args.matches))
+            for timing in speed.compare(cells[0], count, few, args.seed, bar.update)
+        ]
     return _print_report(speed.write_report(args.output, comparison, scaling), args.output)
 
 
@@ -221,27 +294,52 @@ def _run_speed(args: argparse.Namespace) -> int:
     _cells(['all'], 'e.g. "640x480-*" or 1280x720-mono8-imu400 (default: all)'),
     # Shorter than one period of the motion, hardly anything is measured.
     _number('--duration', 60.0, 'length of each cell', low=5),
-    Argument('--soak', {
-        'type': float, 'nargs': '?', 'const': 10.0, 'default': 0.0, 'metavar': 'MINUTES',
-        'help': 'play the cells so long instead (default: 10), and show memory and latency over '
-                'time'}, 0),
-    _paths('--against', 'PATH',
-           'instead, compare this checkout with the one at PATH by turns in one run: ratios of '
-           'latency, processor time, memory and errors'))
+    Argument(
+        '--soak',
+        {
+            'type': float,
+            'nargs': '?',
+            'const': 10.0,
+            'default': 0.0,
+            'metavar': 'MINUTES',
+            'help': 'play the cells so long instead (default: 10), and show memory and latency '
+            'over '
+            'time',
+        },
+        0,
+    ),
+    _paths(
+        '--against',
+        'PATH',
+        'instead, compare this checkout with the one at PATH by turns in one run: ratios of '
+        'latency, processor time, memory and errors',
+    ),
+)
 def _run_live(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import live
     from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
+
     names = matching_cells(args.cells, live.CELLS)
     cells = [live.CELLS[name] for name in names]
     _need_ros()
     if args.against is not None:
         if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
-            raise InputError(f'--against {args.against} is no checkout of this package: give the '
-                             'folder that contains rs_relpose_ros')
+            raise InputError(
+                f'--against {args.against} is no checkout of this package: give the '
+                'folder that contains rs_relpose_ros'
+            )
         with progress_bar(2 * live.TURNS * len(names), 'run') as bar:
-            return _print_report(live.compare_checkouts(
-                Path(__file__).resolve().parents[2], args.against, names, args.duration,
-                args.output, bar.update), args.output)
+            return _print_report(
+                live.compare_checkouts(
+                    Path(__file__).resolve().parents[2],
+                    args.against,
+                    names,
+                    args.duration,
+                    args.output,
+                    bar.update,
+                ),
+                args.output,
+            )
     duration = 60.0 * args.soak or args.duration
     profile = _shipped('fastdds.xml')
     sizes = sorted({(cell.width, cell.height) for cell in cells})
@@ -253,9 +351,14 @@ def _run_live(args: argparse.Namespace) -> int:
             bar.set_description(cell.name)
             try:
                 statistics, course = live.run_cell(
-                    cell, clips[cell.width, cell.height], duration, args.output / cell.name,
-                    profile, bar.update)
-            except RsRelposeError as error:   # the other cells are still measured
+                    cell,
+                    clips[cell.width, cell.height],
+                    duration,
+                    args.output / cell.name,
+                    profile,
+                    bar.update,
+                )
+            except RsRelposeError as error:  # the other cells are still measured
                 failed = True
                 print(f'{cell.name}: {error}', file=sys.stderr)
                 continue
@@ -270,13 +373,21 @@ def _run_live(args: argparse.Namespace) -> int:
 @_benchmark(
     'live-cases',
     'faults of drivers and configurations, each with a node of its own: named, or harmless. '
-    'Needs ROS', _cells(['*'], 'all by default'))
+    'Needs ROS',
+    _cells(['*'], 'all by default'),
+)
 def _run_cases(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import live_cases
     from rs_relpose_lab.live.live_cases import CASES
+
     chosen = [CASES[name] for name in matching_cells(args.cells, CASES)]
-    return _report_of(chosen, lambda case: live_cases.run_case(case, args.output / 'walk'),
-                      live_cases.write_report, args, 'case')
+    return _report_of(
+        chosen,
+        lambda case: live_cases.run_case(case, args.output / 'walk'),
+        live_cases.write_report,
+        args,
+        'case',
+    )
 
 
 @_benchmark(
@@ -284,16 +395,31 @@ def _run_cases(args: argparse.Namespace) -> int:
     'whether covariances hold: squared errors in their units (NEES by degrees of freedom), over '
     'the pairs of rendered walks, and over the true pairs of recordings',
     _number('--bags', 12, 'simulated bags'),
-    _number('--exposure', 0.0, 'exposure of a row in the simulated bags, as motion blur [ms]',
-            metavar='MS'),
-    _paths('--recording', ('BAG', 'PARAMETERS', 'PAIRS'),
-           'a recording, its parameter file and a table of true pairs (pseudo_truth.csv); may be '
-           'given several times', nargs=3, action='append', default=[]),
-    _flag('--compare', 'on the pairs of the recordings also this package with a readout time of '
-                       "0, and OpenCV's 5-point (USAC_MAGSAC)"),
-    _seed(401, 'bag'))
+    _number(
+        '--exposure',
+        0.0,
+        'exposure of a row in the simulated bags, as motion blur [ms]',
+        metavar='MS',
+    ),
+    _paths(
+        '--recording',
+        ('BAG', 'PARAMETERS', 'PAIRS'),
+        'a recording, its parameter file and a table of true pairs (pseudo_truth.csv); may be '
+        'given several times',
+        nargs=3,
+        action='append',
+        default=[],
+    ),
+    _flag(
+        '--compare',
+        'on the pairs of the recordings also this package with a readout time of '
+        "0, and OpenCV's 5-point (USAC_MAGSAC)",
+    ),
+    _seed(401, 'bag'),
+)
 def _run_consistency(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import consistency
+
     if not args.bags and not args.recording:
         raise InputError('--bags 0 needs a --recording: there is nothing to measure')
     if args.compare and not args.recording:
@@ -301,11 +427,16 @@ def _run_consistency(args: argparse.Namespace) -> int:
     args.output.mkdir(parents=True, exist_ok=True)
     on_recording = partial(consistency.on_recording, compare=args.compare)
     chosen = [partial(on_recording, *recording) for recording in args.recording] + [
-        partial(consistency.on_simulated_bag, config,
-                args.output / f'seed_{config.seed}_{args.exposure:g}ms')
-        for config in consistency.configurations(args.bags, args.seed, 1e-3 * args.exposure)]
-    return _report_of(chosen, lambda measure: list(measure()), consistency.write_report, args,
-                      'bag')
+        partial(
+            consistency.on_simulated_bag,
+            config,
+            args.output / f'seed_{config.seed}_{args.exposure:g}ms',
+        )
+        for config in consistency.configurations(args.bags, args.seed, 1e-3 * args.exposure)
+    ]
+    return _report_of(
+        chosen, lambda measure: list(measure()), consistency.write_report, args, 'bag'
+    )
 
 
 @_benchmark(
@@ -313,9 +444,12 @@ def _run_consistency(args: argparse.Namespace) -> int:
     "images derotated to their middle row: against a renderer's truth, OpenCV's 5-point on raw "
     'and derotated images, processor time of a frame',
     _number('--walks', 6, 'walks of 2 s on which the map is compared with the truth'),
-    _number('--bags', 6, "rendered bags for OpenCV's 5-point"), _seed(8101, 'recording'))
+    _number('--bags', 6, "rendered bags for OpenCV's 5-point"),
+    _seed(8101, 'recording'),
+)
 def _run_global_shutter(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import global_shutter
+
     args.output.mkdir(parents=True, exist_ok=True)
     speeds = [global_shutter.frame_times(*size) for size in global_shutter.SIZES]
     cases = global_shutter.map_cases(args.walks, args.seed)
@@ -326,8 +460,9 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
             maps.append(global_shutter.map_errors(*case))
             bar.update()
         for config in configs:
-            bags.append(global_shutter.five_point_on_bag(
-                config, args.output / f'seed_{config.seed}'))
+            bags.append(
+                global_shutter.five_point_on_bag(config, args.output / f'seed_{config.seed}')
+            )
             bar.update()
     return _print_report(global_shutter.write_report(args.output, maps, bags, speeds), args.output)
 
@@ -343,11 +478,19 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
     _paths('--euroc', 'FOLDER', 'also corners of a real recording, euroc_imu_april_corners'),
     _number('--disturbances', 0, 'instead, walks with each disturbance'),
     _number('--loops', 0, 'instead, closed walks of 60 s, with and without loop closures'),
-    _paths('--recordings', 'BAG', 'instead, bags with the right parameters next to them '
-           '(BAG.yaml), whole and in parts', nargs='+'),
-    _number('--part', 4.5, 'length of a part of these'), _seed(7101, 'walk'), _JOBS)
+    _paths(
+        '--recordings',
+        'BAG',
+        'instead, bags with the right parameters next to them (BAG.yaml), whole and in parts',
+        nargs='+',
+    ),
+    _number('--part', 4.5, 'length of a part of these'),
+    _seed(7101, 'walk'),
+    _JOBS,
+)
 def _run_odometry(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
+
     need_gtsam()
     from rs_relpose_lab.experiments import (
         odometry,
@@ -355,30 +498,53 @@ def _run_odometry(args: argparse.Namespace) -> int:
         odometry_loops,
         odometry_recordings,
     )
+
     if args.recordings:
         return _report_of(
-            args.recordings, lambda bag: list(odometry_recordings.on_recording(bag, args.part)),
-            odometry_recordings.write_report, args, 'bag')
+            args.recordings,
+            lambda bag: list(odometry_recordings.on_recording(bag, args.part)),
+            odometry_recordings.write_report,
+            args,
+            'bag',
+        )
     if args.disturbances:
-        return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
-                          odometry_disturbances.measure, odometry_disturbances.write_report,
-                          args, 'walk')
+        return _report_of(
+            odometry_disturbances.tasks(args.disturbances, args.seed),
+            odometry_disturbances.measure,
+            odometry_disturbances.write_report,
+            args,
+            'walk',
+        )
     if args.loops:
-        return _report_of([args.seed + k for k in range(args.loops)], odometry_loops.on_seed,
-                          odometry_loops.write_report, args, 'walk')
+        return _report_of(
+            [args.seed + k for k in range(args.loops)],
+            odometry_loops.on_seed,
+            odometry_loops.write_report,
+            args,
+            'walk',
+        )
     walks, seed = odometry.walks, args.seed
-    chosen = [*walks(args.walks, seed), *walks(args.global_shutter, seed, readout=0.0),
-              *walks(args.in_motion, seed + 100, plan=f'walk:{odometry.SHORT:g}'),
-              *walks(args.long, seed + 200, odometry.LONG)]
+    chosen = [
+        *walks(args.walks, seed),
+        *walks(args.global_shutter, seed, readout=0.0),
+        *walks(args.in_motion, seed + 100, plan=f'walk:{odometry.SHORT:g}'),
+        *walks(args.long, seed + 200, odometry.LONG),
+    ]
     if not chosen and args.euroc is None:
         raise InputError('there is nothing to measure: give --walks or --euroc')
     args.output.mkdir(parents=True, exist_ok=True)
-    known = [] if args.euroc is None else [
-        odometry.on_euroc(args.euroc, args.output / 'euroc.png')]
+    known = (
+        [] if args.euroc is None else [odometry.on_euroc(args.euroc, args.output / 'euroc.png')]
+    )
     if not chosen:
         return _print_report(odometry.write_report(args.output, known), args.output)
-    return _report_of(chosen, odometry.on_walk, lambda folder, paths: odometry.write_report(
-        folder, [*known, *paths]), args, 'recording')
+    return _report_of(
+        chosen,
+        odometry.on_walk,
+        lambda folder, paths: odometry.write_report(folder, [*known, *paths]),
+        args,
+        'recording',
+    )
 
 
 @_benchmark(
@@ -386,13 +552,23 @@ def _run_odometry(args: argparse.Namespace) -> int:
     'poses of rows, as exported by `rs_relpose export`, against the truth, and frames rendered '
     'with them. Needs gtsam',
     _number('--walks', 6, 'walks with standstills and pure rotations'),
-    _number('--seconds', 20.0, 'of each'), _seed(9101, 'walk'), _JOBS)
+    _number('--seconds', 20.0, 'of each'),
+    _seed(9101, 'walk'),
+    _JOBS,
+)
 def _run_reconstruction(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
+
     need_gtsam()
     from rs_relpose_lab.experiments import odometry, reconstruction
-    return _report_of(odometry.walks(args.walks, args.seed, args.seconds), reconstruction.on_walk,
-                      reconstruction.write_report, args, 'walk')
+
+    return _report_of(
+        odometry.walks(args.walks, args.seed, args.seconds),
+        reconstruction.on_walk,
+        reconstruction.write_report,
+        args,
+        'walk',
+    )
 
 
 @_benchmark(
@@ -401,20 +577,39 @@ def _run_reconstruction(args: argparse.Namespace) -> int:
     'with its file against those with the true calibration',
     _number('--bags', 10, 'bags, each with a lens of its own', low=1),
     _number('--seconds', 20.0, 'length of a bag'),
-    Argument('--model', {'choices': ('plumb_bob', 'equidistant'), 'default': 'plumb_bob',
-                         'help': 'distortion model (default: %(default)s)'}),
-    _flag('--live', 'calibrate as a running node does, from the first seconds that suffice '
-                    '(plumb_bob)'),
-    _flag('--known', 'bags with a CameraInfo that has the lens'), _seed(601, 'bag'))
+    Argument(
+        '--model',
+        {
+            'choices': ('plumb_bob', 'equidistant'),
+            'default': 'plumb_bob',
+            'help': 'distortion model (default: %(default)s)',
+        },
+    ),
+    _flag(
+        '--live',
+        'calibrate as a running node does, from the first seconds that suffice (plumb_bob)',
+    ),
+    _flag('--known', 'bags with a CameraInfo that has the lens'),
+    _seed(601, 'bag'),
+)
 def _run_lenses(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import lenses
+
     return _report_of(
         range(args.seed, args.seed + args.bags),
         lambda seed: lenses.on_lens(
-            seed, args.model, args.seconds, args.output / '_'.join(
-                ['known'] * args.known + [args.model, str(seed), f'{args.seconds:g}s']),
-            live=args.live, known=args.known),
-        lenses.write_report, args, 'bag')
+            seed,
+            args.model,
+            args.seconds,
+            args.output
+            / '_'.join(['known'] * args.known + [args.model, str(seed), f'{args.seconds:g}s']),
+            live=args.live,
+            known=args.known,
+        ),
+        lenses.write_report,
+        args,
+        'bag',
+    )
 
 
 @_benchmark(
@@ -423,16 +618,32 @@ def _run_lenses(args: argparse.Namespace) -> int:
     'every quantity over the parts',
     _paths('bags', 'BAG', 'recordings of one camera with one IMU', nargs='+'),
     _number('--seconds', 4.0, 'length of a part', low=0.1),
-    Argument('--rows', {'metavar': ('FIRST', 'LAST'), 'type': float, 'nargs': 2,
-                        'default': (0.0, 0.0), 'help': 'use only these image rows'}))
+    Argument(
+        '--rows',
+        {
+            'metavar': ('FIRST', 'LAST'),
+            'type': float,
+            'nargs': 2,
+            'default': (0.0, 0.0),
+            'help': 'use only these image rows',
+        },
+    ),
+)
 def _run_calibration_stretches(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import calibration
-    parts = [part for bag in args.bags for part in calibration.calibrated_parts(
-        bag.name, calibration.read_bag(bag, tuple(args.rows)), args.seconds, print)]
+
+    parts = [
+        part
+        for bag in args.bags
+        for part in calibration.calibrated_parts(
+            bag.name, calibration.read_bag(bag, tuple(args.rows)), args.seconds, print
+        )
+    ]
     if not parts:
         raise InputError('no part of these bags can be calibrated')
-    return _print_report(calibration.write_parts_report(
-        args.output, calibration.quantities_of(parts)), args.output)
+    return _print_report(
+        calibration.write_parts_report(args.output, calibration.quantities_of(parts)), args.output
+    )
 
 
 @_benchmark(
@@ -440,25 +651,52 @@ def _run_calibration_stretches(args: argparse.Namespace) -> int:
     'wrong configurations: which the consistency monitor flags, and errors of the published '
     'poses, over simulated bags (tracks without images) and recordings; docs/lab/trust.md',
     _number('--bags', 20, 'simulated bags, each with all rows'),
-    Argument('--rows', {
-        'nargs': '+', 'default': ['all'], 'metavar': 'NAME', 'help': 'wrong configurations, with '
-        '* as in file names, e.g. "readout-*" (default: all)'}),
+    Argument(
+        '--rows',
+        {
+            'nargs': '+',
+            'default': ['all'],
+            'metavar': 'NAME',
+            'help': 'wrong configurations, with '
+            '* as in file names, e.g. "readout-*" (default: all)',
+        },
+    ),
     # A shorter bag has not enough information for gross errors.
     _number('--seconds', 30.0, 'length of a simulated bag', low=6),
-    _number('--right', 0, 'further bags with the right configuration, for false alarms: noise at '
-            'the configured level, half of it and twice'),
+    _number(
+        '--right',
+        0,
+        'further bags with the right configuration, for false alarms: noise at '
+        'the configured level, half of it and twice',
+    ),
     _number('--rendered', 0, 'bags with images: the first ones of the others, rendered'),
-    _paths('--recordings', 'PATH', 'bags with the right parameters next to them (BAG.yaml)',
-           nargs='+', default=[]),
-    _seed(1001, 'bag'), _JOBS)
+    _paths(
+        '--recordings',
+        'PATH',
+        'bags with the right parameters next to them (BAG.yaml)',
+        nargs='+',
+        default=[],
+    ),
+    _seed(1001, 'bag'),
+    _JOBS,
+)
 def _run_trust(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import trust
     from rs_relpose_lab.experiments.trust_rows import ROWS
-    chosen = trust.tasks(matching_cells(args.rows, ROWS), args.bags, args.seconds, args.seed,
-                         right=args.right, rendered=args.rendered, recordings=args.recordings)
+
+    chosen = trust.tasks(
+        matching_cells(args.rows, ROWS),
+        args.bags,
+        args.seconds,
+        args.seed,
+        right=args.right,
+        rendered=args.rendered,
+        recordings=args.recordings,
+    )
     if not chosen:
-        raise InputError('there is nothing to measure: give --bags, --right, --rendered or '
-                         '--recordings')
+        raise InputError(
+            'there is nothing to measure: give --bags, --right, --rendered or --recordings'
+        )
     return _report_of(chosen, trust.measure, trust.write_report, args, 'recording')
 
 
@@ -466,9 +704,22 @@ def _run_trust(args: argparse.Namespace) -> int:
     'suggestions',
     'one wrong parameter at a time on recordings: which the consistency monitor names, and errors '
     'of its suggested values; docs/lab/trust.md',
-    _paths('--recording', ('BAG', 'PARAMETERS'), 'a recording and its right parameter file; may '
-           'be given several times', nargs=2, action='append', required=True))
+    _paths(
+        '--recording',
+        ('BAG', 'PARAMETERS'),
+        'a recording and its right parameter file; may be given several times',
+        nargs=2,
+        action='append',
+        required=True,
+    ),
+)
 def _run_suggestions(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import suggestions
-    return _report_of(args.recording, lambda one: suggestions.on_recording(*one),
-                      suggestions.write_report, args, 'recording')
+
+    return _report_of(
+        args.recording,
+        lambda one: suggestions.on_recording(*one),
+        suggestions.write_report,
+        args,
+        'recording',
+    )

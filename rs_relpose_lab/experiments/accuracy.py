@@ -28,12 +28,12 @@ class Trial:
 
     cell: str
     noise: Noise
-    sigma_factor: float   # configured sigmas by the true ones
+    sigma_factor: float  # configured sigmas by the true ones
     seed: int
     status: str
     error: PoseError
     oracle: PoseError
-    duration: float   # of the whole estimate [s]
+    duration: float  # of the whole estimate [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,12 @@ class AccuracyRun:
         return len(self.cells) * len(self.noises) * len(self.sigma_factors) * self.trials
 
 
-def run_accuracy(run: AccuracyRun, kept: Path, jobs: int = 1,
-                 on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
+def run_accuracy(
+    run: AccuracyRun,
+    kept: Path,
+    jobs: int = 1,
+    on_trials: Callable[[int], object] = lambda count: None,
+) -> list[Trial]:
     """Run all trials.
 
     `kept`: folder of the oracle's errors. It need not run again while the estimator is developed.
@@ -62,21 +66,30 @@ def run_accuracy(run: AccuracyRun, kept: Path, jobs: int = 1,
     `on_trials`: called with the number of estimates that have been added.
     """
     # One file for each state of what decides its content.
-    source = b''.join(Path(str(module.__file__)).read_bytes() for module in (
-        rows, problems, oracle))
+    source = b''.join(
+        Path(str(module.__file__)).read_bytes() for module in (rows, problems, oracle)
+    )
     path = kept / f'{hashlib.sha256(source).hexdigest()[:24]}.json'
     known = json.loads(path.read_text()) if path.is_file() else {}
     kept.mkdir(parents=True, exist_ok=True)
     seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
-    tasks = [(run, cell, noise, [(seed, known.get(f'{cell} {noise} {seed}'))
-                                 for seed in seeds[first:first + chunk]])
-             for cell in run.cells for noise in run.noises
-             for first in range(0, run.trials, chunk)]
+    tasks = [
+        (
+            run,
+            cell,
+            noise,
+            [(seed, known.get(f'{cell} {noise} {seed}')) for seed in seeds[first : first + chunk]],
+        )
+        for cell in run.cells
+        for noise in run.noises
+        for first in range(0, run.trials, chunk)
+    ]
     trials: list[Trial] = []
     for done in in_processes(_run, tasks, jobs, warm_up):
         trials += done
-        known |= {f'{trial.cell} {trial.noise} {trial.seed}': astuple(trial.oracle)
-                  for trial in done}
+        known |= {
+            f'{trial.cell} {trial.noise} {trial.seed}': astuple(trial.oracle) for trial in done
+        }
         # Replaced as a whole, so that an interrupted run leaves no partial file.
         path.with_suffix('.new').write_text(json.dumps(known))
         path.with_suffix('.new').replace(path)
@@ -84,8 +97,9 @@ def run_accuracy(run: AccuracyRun, kept: Path, jobs: int = 1,
     return trials
 
 
-def _run(task: tuple[AccuracyRun, str, Noise, list[tuple[int, list[float] | None]]],
-         ) -> list[Trial]:
+def _run(
+    task: tuple[AccuracyRun, str, Noise, list[tuple[int, list[float] | None]]],
+) -> list[Trial]:
     """Some seeds of a cell, with the oracle's errors where they are known."""
     run, name, noise, seeds = task
     cell, method = CELLS[name], replace(METHODS['auto'], solver=run.solver)
@@ -100,14 +114,21 @@ def _run(task: tuple[AccuracyRun, str, Noise, list[tuple[int, list[float] | None
             pose = call()
             duration = time.perf_counter() - started
             assert isinstance(pose, RelativePose)
-            trials.append(Trial(name, noise, factor, seed, pose.status.value, pair.error(pose),
-                                best, duration))
+            trials.append(
+                Trial(
+                    name, noise, factor, seed, pose.status.value, pair.error(pose), best, duration
+                )
+            )
     return trials
 
 
 def _oracle_error(cell: Cell, problem: TwoViewProblem) -> PoseError:
-    best = oracle_estimate(problem, cell.pixel_noise, float(np.radians(cell.gravity_noise)),
-                           float(np.radians(cell.gyro_noise)))
+    best = oracle_estimate(
+        problem,
+        cell.pixel_noise,
+        float(np.radians(cell.gravity_noise)),
+        float(np.radians(cell.gyro_noise)),
+    )
     return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
 
 
@@ -121,8 +142,8 @@ GROSS_ERROR = 2.0
 class Consistency:
     """Errors in units of the covariance."""
 
-    mean: float   # of the inner 98 % of NEES / 5: 1 is right, more is overconfident
-    above: float   # share above the 95 % quantile of chi-square: 0.05 is right
+    mean: float  # of the inner 98 % of NEES / 5: 1 is right, more is overconfident
+    above: float  # share above the 95 % quantile of chi-square: 0.05 is right
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,17 +157,17 @@ class CellStatistics:
     sigma_factor: float
     cell: str
     trials: int
-    lost: int   # trials without a pose
-    gross: int   # trials with a rotation more than `GROSS_ERROR` wrong
+    lost: int  # trials without a pose
+    gross: int  # trials with a rotation more than `GROSS_ERROR` wrong
     rotation: Quantiles
     translation: Quantiles
     oracle_rotation: Quantiles
     oracle_translation: Quantiles
-    rotation_ratio: Quantiles   # estimator by oracle
-    translation_ratio: Quantiles   # likewise
+    rotation_ratio: Quantiles  # estimator by oracle
+    translation_ratio: Quantiles  # likewise
     nees: Consistency
     oracle_nees: Consistency
-    duration: float   # median [ms]
+    duration: float  # median [ms]
 
 
 def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:
@@ -156,16 +177,22 @@ def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:
     best_rotation = Quantiles.of(trial.oracle.rotation for trial in trials)
     best_translation = Quantiles.of(trial.oracle.translation for trial in trials)
     return CellStatistics(
-        noise=trials[0].noise, sigma_factor=trials[0].sigma_factor, cell=trials[0].cell,
+        noise=trials[0].noise,
+        sigma_factor=trials[0].sigma_factor,
+        cell=trials[0].cell,
         trials=len(trials),
         lost=sum(bool(np.isinf(trial.error.rotation)) for trial in trials),
         gross=sum(GROSS_ERROR < trial.error.rotation < np.inf for trial in trials),
-        rotation=rotation, translation=translation, oracle_rotation=best_rotation,
-        oracle_translation=best_translation, rotation_ratio=_ratio(rotation, best_rotation),
+        rotation=rotation,
+        translation=translation,
+        oracle_rotation=best_rotation,
+        oracle_translation=best_translation,
+        rotation_ratio=_ratio(rotation, best_rotation),
         translation_ratio=_ratio(translation, best_translation),
         nees=consistency([trial.error.nees for trial in trials]),
         oracle_nees=consistency([trial.oracle.nees for trial in trials]),
-        duration=float(np.median([trial.duration for trial in trials])) * 1e3)
+        duration=float(np.median([trial.duration for trial in trials])) * 1e3,
+    )
 
 
 def consistency(nees: Sequence[float]) -> Consistency:
@@ -173,8 +200,10 @@ def consistency(nees: Sequence[float]) -> Consistency:
     known = np.array([value for value in nees if not np.isnan(value)])
     if len(known) == 0:
         return Consistency(float('nan'), float('nan'))
-    return Consistency(float(trim_mean(known, 0.01)) / POSE_FREEDOM,
-                       float((known > chi2.ppf(0.95, POSE_FREEDOM)).mean()))
+    return Consistency(
+        float(trim_mean(known, 0.01)) / POSE_FREEDOM,
+        float((known > chi2.ppf(0.95, POSE_FREEDOM)).mean()),
+    )
 
 
 def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
@@ -183,6 +212,7 @@ def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
 
 def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
     """Name, value and limit of the project's criteria, over cells of one noise and factor."""
+
     def column(name: str) -> Array:
         return np.array([attrgetter(name)(cell) for cell in cells])
 
@@ -191,13 +221,21 @@ def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
     return [
         ('ratio of median rotation errors, median over cells', _median(rotation), '<= 1.10'),
         ('ratio of median translation errors, median over cells', _median(translation), '<= 1.20'),
-        ('ratio of median errors, largest of a cell',
-         float(np.maximum(rotation, translation).max()), '<= 1.6'),
-        ('ratio of 90th percentiles of rotation, median over cells',
-         _median(column('rotation_ratio.p90')), '<= 1.5'),
-        ('ratio of 90th percentiles of translation, median over cells',
-         _median(column('translation_ratio.p90')), '<= 1.5'),
-
+        (
+            'ratio of median errors, largest of a cell',
+            float(np.maximum(rotation, translation).max()),
+            '<= 1.6',
+        ),
+        (
+            'ratio of 90th percentiles of rotation, median over cells',
+            _median(column('rotation_ratio.p90')),
+            '<= 1.5',
+        ),
+        (
+            'ratio of 90th percentiles of translation, median over cells',
+            _median(column('translation_ratio.p90')),
+            '<= 1.5',
+        ),
         ('lost poses', float(column('lost').sum()), '0'),
         (f'rotations wrong by more than {GROSS_ERROR:g} deg', float(column('gross').sum()), '0'),
         ('NEES / 5, smallest of a cell', float(mean.min()), '>= 0.8'),
@@ -214,8 +252,10 @@ def _median(values: Array) -> float:
 
 def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str:
     """Write every trial, the statistics of every cell, the plot and the report; the report."""
-    cells = [cell_statistics(group) for group in grouped(
-        trials, attrgetter('noise', 'sigma_factor', 'cell')).values()]
+    cells = [
+        cell_statistics(group)
+        for group in grouped(trials, attrgetter('noise', 'sigma_factor', 'cell')).values()
+    ]
     write_csv(folder / 'trials.csv', trials)
     write_csv(folder / 'cells.csv', cells)
     report = _report(run, cells)
@@ -226,18 +266,43 @@ def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str
 def _report(run: AccuracyRun, cells: Sequence[CellStatistics]) -> str:
     parts = [
         '# Accuracy against the oracle\n',
-        (f'{run.trials} trials a cell, solver `{run.solver}`, errors in degrees '
-         '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of the '
-         'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n')]
+        (
+            f'{run.trials} trials a cell, solver `{run.solver}`, errors in degrees '
+            '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of '
+            'the '
+            'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n'
+        ),
+    ]
     settings = grouped(cells, attrgetter('noise', 'sigma_factor'))
     for (noise, factor), group in settings.items():
         parts.append(f'## Noise of gravity: {noise}; sigmas {factor:g} times the true ones\n')
-        parts.append(markdown_table(
-            ('cell', 'R', 'oracle', 'ratio', 't', 'oracle', 'ratio', 'lost', 'gross', 'NEES / 5',
-             'oracle', 'above [%]', 'oracle', 'ms'), [_row(cell) for cell in group]))
-        parts.append(markdown_table(
-            ('over all cells', 'value', 'wanted'),
-            [(name, f'{value:.3g}', limit) for name, value, limit in summary(group)]))
+        parts.append(
+            markdown_table(
+                (
+                    'cell',
+                    'R',
+                    'oracle',
+                    'ratio',
+                    't',
+                    'oracle',
+                    'ratio',
+                    'lost',
+                    'gross',
+                    'NEES / 5',
+                    'oracle',
+                    'above [%]',
+                    'oracle',
+                    'ms',
+                ),
+                [_row(cell) for cell in group],
+            )
+        )
+        parts.append(
+            markdown_table(
+                ('over all cells', 'value', 'wanted'),
+                [(name, f'{value:.3g}', limit) for name, value, limit in summary(group)],
+            )
+        )
         reference = settings.get((noise, 1.0))
         if factor != 1.0 and reference:
             parts.append(_against_true_sigmas(group, reference))
@@ -246,15 +311,27 @@ def _report(run: AccuracyRun, cells: Sequence[CellStatistics]) -> str:
 
 def _row(cell: CellStatistics) -> tuple[str, ...]:
     return (
-        cell.cell, cell.rotation.text(3), cell.oracle_rotation.text(3),
-        cell.rotation_ratio.text(2), cell.translation.text(3), cell.oracle_translation.text(3),
-        cell.translation_ratio.text(2), f'{cell.lost}', f'{cell.gross}', f'{cell.nees.mean:.2f}',
-        f'{cell.oracle_nees.mean:.2f}', f'{100 * cell.nees.above:.1f}',
-        f'{100 * cell.oracle_nees.above:.1f}', f'{cell.duration:.1f}')
+        cell.cell,
+        cell.rotation.text(3),
+        cell.oracle_rotation.text(3),
+        cell.rotation_ratio.text(2),
+        cell.translation.text(3),
+        cell.oracle_translation.text(3),
+        cell.translation_ratio.text(2),
+        f'{cell.lost}',
+        f'{cell.gross}',
+        f'{cell.nees.mean:.2f}',
+        f'{cell.oracle_nees.mean:.2f}',
+        f'{100 * cell.nees.above:.1f}',
+        f'{100 * cell.oracle_nees.above:.1f}',
+        f'{cell.duration:.1f}',
+    )
 
 
-def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[CellStatistics],
-                         ) -> str:
+def _against_true_sigmas(
+    group: Sequence[CellStatistics],
+    reference: Sequence[CellStatistics],
+) -> str:
     """Table of errors by those with the true sigmas."""
     configured = {cell.cell: cell for cell in reference}
     rows = []
@@ -262,6 +339,12 @@ def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[Ce
         for statistic in ('median', 'p90'):
             value = attrgetter(f'{name}.{statistic}')
             ratios = np.array([value(cell) / value(configured[cell.cell]) for cell in group])
-            rows.append((f'{statistic} {name} error by that with the true sigmas',
-                         f'{_median(ratios):.3g}', f'{ratios.max():.3g}', '<= 1.3'))
+            rows.append(
+                (
+                    f'{statistic} {name} error by that with the true sigmas',
+                    f'{_median(ratios):.3g}',
+                    f'{ratios.max():.3g}',
+                    '<= 1.3',
+                )
+            )
     return markdown_table(('over all cells', 'median', 'largest', 'wanted'), rows)

@@ -31,7 +31,7 @@ class PartQuantity:
     """A quantity of one part, in the unit of its name."""
 
     bag: str
-    begin: float        # of the part, since the first image of the bag [s]
+    begin: float  # of the part, since the first image of the bag [s]
     name: str
     value: float
     sigma: float
@@ -45,7 +45,7 @@ class Part:
     bag: str
     begin: float
     result: CalibrationResult
-    focal: float        # that was assumed [px]
+    focal: float  # that was assumed [px]
 
 
 def parts_of(tracks: Tracks, seconds: float) -> Iterator[tuple[float, Tracks]]:
@@ -58,19 +58,28 @@ def parts_of(tracks: Tracks, seconds: float) -> Iterator[tuple[float, Tracks]]:
             continue
         first, last = inside[0], inside[-1]
         kept = (tracks.frames >= first) & (tracks.frames <= last)
-        yield begin, Tracks(tracks.stamps_ns[inside], tracks.frames[kept] - first,
-                            tracks.ids[kept], tracks.points[kept])
+        yield (
+            begin,
+            Tracks(
+                tracks.stamps_ns[inside],
+                tracks.frames[kept] - first,
+                tracks.ids[kept],
+                tracks.points[kept],
+            ),
+        )
 
 
 def read_bag(path: Path, rows: tuple[float, float]) -> CalibrationInput:
     """Tracks and gyro of a bag; of its image only these rows are used, all where both are 0."""
     with open_bag(path) as bag:
-        return read_recording(bag, bag.find_topics(needs_camera_info=False),
-                              TrackingConfig(feature_rows=rows))
+        return read_recording(
+            bag, bag.find_topics(needs_camera_info=False), TrackingConfig(feature_rows=rows)
+        )
 
 
-def calibrated_parts(name: str, recording: CalibrationInput, seconds: float,
-                     refused: Callable[[str], object]) -> Iterator[Part]:
+def calibrated_parts(
+    name: str, recording: CalibrationInput, seconds: float, refused: Callable[[str], object]
+) -> Iterator[Part]:
     """Calibration of each part; `refused` gets the reason why one cannot be used."""
     for begin, tracks in parts_of(recording.tracks, seconds):
         try:
@@ -86,11 +95,19 @@ def quantities_of(parts: Sequence[Part]) -> list[PartQuantity]:
     interval = float(np.median([part.result.frame_interval for part in parts]))
     slope = _common_slope(parts)
     reference = Rotation.from_matrix(parts[0].result.R_cam_imu)
-    return [PartQuantity(part.bag, part.begin, name, scale * estimate.value,
-                         scale * estimate.sigma, estimate.observable)
-            for part in parts
-            for name, estimate, scale in _quantities(part, interval, slope, reference)
-            if estimate is not None]
+    return [
+        PartQuantity(
+            part.bag,
+            part.begin,
+            name,
+            scale * estimate.value,
+            scale * estimate.sigma,
+            estimate.observable,
+        )
+        for part in parts
+        for name, estimate, scale in _quantities(part, interval, slope, reference)
+        if estimate is not None
+    ]
 
 
 def _common_slope(parts: Sequence[Part]) -> Estimate | None:
@@ -104,20 +121,30 @@ def _common_slope(parts: Sequence[Part]) -> Estimate | None:
     return Estimate(mean, float(weights.sum() ** -0.5), True)
 
 
-def _quantities(part: Part, interval: float, slope: Estimate | None, reference: Rotation,
-                ) -> Iterator[tuple[str, Estimate | None, float]]:
+def _quantities(
+    part: Part,
+    interval: float,
+    slope: Estimate | None,
+    reference: Rotation,
+) -> Iterator[tuple[str, Estimate | None, float]]:
     """Name, estimate and factor to the unit of the name."""
     result = part.result
     offset, longer = result.time_offset, interval - result.frame_interval
     if slope is not None:
-        offset = Estimate(offset.value + slope.value * longer,
-                          math.hypot(offset.sigma, slope.sigma * longer), offset.observable)
+        offset = Estimate(
+            offset.value + slope.value * longer,
+            math.hypot(offset.sigma, slope.sigma * longer),
+            offset.observable,
+        )
     rotation = (Rotation.from_matrix(result.R_cam_imu) * reference.inv()).as_rotvec()
     yield 'readout time [ms]', result.readout_time, 1e3
     yield 'time offset [ms]', offset, 1e3
     for axis, angle, bias in zip('xyz', rotation, result.gyro_bias, strict=True):
-        yield (f'rotation, {axis} [deg]', replace(result.rotation, value=float(angle)),
-               math.degrees(1.0))
+        yield (
+            f'rotation, {axis} [deg]',
+            replace(result.rotation, value=float(angle)),
+            math.degrees(1.0),
+        )
         yield f'gyro bias, {axis} [mrad/s]', replace(bias, sigma=result.bias_sigma), 1e3
     yield 'focal length [px]', result.lens and result.lens.focal_factor, part.focal
     yield 'offset by interval [ms/ms]', result.offset_by_interval, 1.0
@@ -137,13 +164,32 @@ def write_parts_report(folder: Path, quantities: Sequence[PartQuantity]) -> str:
     rows = []
     for name in dict.fromkeys(quantity.name for quantity in quantities):
         own = [quantity for quantity in quantities if quantity.name == name]
-        rows.append([name, ', '.join(
-            f'{q.value:.2f} +- {q.sigma:.2f}{"" if q.observable else " (no)"}' for q in own),
-            *_chi_squared_cells([own]), *_chi_squared_cells(
-                grouped(own, lambda quantity: quantity.bag).values())])
-    return write_table(folder, 'calibration_stretches', quantities, markdown_table(
-        ['quantity', 'parts; (no): not observable', 'chi2 / dof about the mean', 'P',
-         "about each recording's mean", 'P'], rows))
+        rows.append(
+            [
+                name,
+                ', '.join(
+                    f'{q.value:.2f} +- {q.sigma:.2f}{"" if q.observable else " (no)"}' for q in own
+                ),
+                *_chi_squared_cells([own]),
+                *_chi_squared_cells(grouped(own, lambda quantity: quantity.bag).values()),
+            ]
+        )
+    return write_table(
+        folder,
+        'calibration_stretches',
+        quantities,
+        markdown_table(
+            [
+                'quantity',
+                'parts; (no): not observable',
+                'chi2 / dof about the mean',
+                'P',
+                "about each recording's mean",
+                'P',
+            ],
+            rows,
+        ),
+    )
 
 
 def _chi_squared_cells(groups: Iterable[Sequence[PartQuantity]]) -> tuple[str, str]:

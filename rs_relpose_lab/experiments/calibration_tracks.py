@@ -25,8 +25,8 @@ class Truth:
     [m/s], rms of the rotation [rad/s].
     """
 
-    readout_time: float = 0.025          # negative: read upwards
-    time_offset: float = 0.02            # t_imu = stamp + time_offset + row / height * readout
+    readout_time: float = 0.025  # negative: read upwards
+    time_offset: float = 0.02  # t_imu = stamp + time_offset + row / height * readout
     R_cam_imu: Array = field(default_factory=lambda: np.eye(3))
     gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.015)
     focal: float = 640.0
@@ -41,9 +41,9 @@ class Truth:
     features: int = 200
     speed: float = 1.0
     rotation_rate: float = math.radians(30.0)
-    exposure_slope: float = 0.0          # of the offset, by the interval to the frame before
-    long_interval: float = 1.0           # intervals of the second half, relative to the first
-    stamp_jitter: float = 0.0            # 1 sigma of each stamp [s]
+    exposure_slope: float = 0.0  # of the offset, by the interval to the frame before
+    long_interval: float = 1.0  # intervals of the second half, relative to the first
+    stamp_jitter: float = 0.0  # 1 sigma of each stamp [s]
 
 
 def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -> Truth:
@@ -55,11 +55,14 @@ def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -
     misalignment = Rotation.from_rotvec(math.radians(2.0) * axis / np.linalg.norm(axis))
     number = rng.integers(24) if axis_map is None else axis_map
     values: dict[str, Any] = {
-        'readout_time': rng.uniform(0.008, 0.040), 'time_offset': rng.uniform(-0.08, 0.08),
+        'readout_time': rng.uniform(0.008, 0.040),
+        'time_offset': rng.uniform(-0.08, 0.08),
         'R_cam_imu': misalignment.as_matrix() @ axis_maps()[number],
-        'gyro_bias': tuple(rng.uniform(-0.05, 0.05, 3)), 'focal': rng.uniform(500.0, 1000.0),
+        'gyro_bias': tuple(rng.uniform(-0.05, 0.05, 3)),
+        'focal': rng.uniform(500.0, 1000.0),
         'gyro_rate': rng.choice([100.0, 200.0, 400.0]),
-        'gyro_noise': 10.0 ** rng.uniform(-4.0, -3.4), 'speed': rng.uniform(0.3, 1.6),
+        'gyro_noise': 10.0 ** rng.uniform(-4.0, -3.4),
+        'speed': rng.uniform(0.3, 1.6),
         'rotation_rate': np.radians(rng.uniform(20.0, 45.0)),
     } | given
     if values['readout_time'] > 0.9 / values.get('fps', 30.0):
@@ -71,8 +74,9 @@ def about_one_axis(axis: int, duration: float) -> Trajectory:
     """Camera that sways about one axis (0 yaw, 1 pitch, 2 roll) and is carried sideways."""
     spacing = 0.03
     times = -1.0 + spacing * np.arange(math.ceil((duration + 2.0) / spacing))
-    positions = np.column_stack([0.3 * np.sin(times), 0.5 * np.cos(0.7 * times),
-                                 np.full(len(times), 1.6)])
+    positions = np.column_stack(
+        [0.3 * np.sin(times), 0.5 * np.cos(0.7 * times), np.full(len(times), 1.6)]
+    )
     angles = np.zeros((len(times), 3))
     angles[:, axis] = 0.4 * np.sin(1.9 * times) + 0.1 * np.sin(5.0 * times)
     return Trajectory(positions, angles, float(times[0]), spacing, ())
@@ -88,19 +92,26 @@ class Recorded:
     trajectory: Trajectory
 
 
-def record(truth: Truth, rng: np.random.Generator,
-           trajectory: Trajectory | None = None) -> Recorded:
+def record(
+    truth: Truth, rng: np.random.Generator, trajectory: Trajectory | None = None
+) -> Recorded:
     """Tracks and gyro along a hand-held walk (or `trajectory`) among points of many depths."""
     intervals = np.full(truth.frames, 1.0 / truth.fps)
-    intervals[truth.frames // 2:] *= truth.long_interval
+    intervals[truth.frames // 2 :] *= truth.long_interval
     # Instants of the first row on the IMU clock, which is the trajectory's.
     times = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
     before = np.concatenate([intervals[:1], intervals[:-1]])
     offsets = truth.time_offset + truth.exposure_slope * (before - np.median(before))
     end = times[-1] + 0.2
     if trajectory is None:
-        trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
-                               speed=truth.speed, rotation_rate=truth.rotation_rate)
+        trajectory = hand_held(
+            rng,
+            -0.7,
+            end + 0.5,
+            Plan.parse(f'walk:{end + 1.0}'),
+            speed=truth.speed,
+            rotation_rate=truth.rotation_rate,
+        )
     frames = _frames(truth, trajectory, times, _world(rng), rng)
     if truth.stamp_jitter:
         offsets = offsets + truth.stamp_jitter * rng.standard_normal(truth.frames)
@@ -108,36 +119,49 @@ def record(truth: Truth, rng: np.random.Generator,
     return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
 
 
-def _gyro(truth: Truth, trajectory: Trajectory, end: float,
-          rng: np.random.Generator) -> GyroSeries:
+def _gyro(
+    truth: Truth, trajectory: Trajectory, end: float, rng: np.random.Generator
+) -> GyroSeries:
     count = int((end + 0.5) * truth.gyro_rate)
     times = -0.5 + (np.arange(count) + rng.uniform()) / truth.gyro_rate
     rates = trajectory.states(times).angular_velocity @ truth.R_cam_imu
     noise = truth.gyro_noise * math.sqrt(truth.gyro_rate) * rng.standard_normal(rates.shape)
-    return GyroSeries(START_NS + np.rint(times * 1e9).astype(np.int64),
-                      rates + np.array(truth.gyro_bias) + noise)
+    return GyroSeries(
+        START_NS + np.rint(times * 1e9).astype(np.int64), rates + np.array(truth.gyro_bias) + noise
+    )
 
 
 def _world(rng: np.random.Generator, count: int = 4000) -> Array:
     """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
     azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
     distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
-    direction = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
-                          np.sin(elevation)], axis=1)
+    direction = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        axis=1,
+    )
     points = np.array([0.0, 0.0, 1.6]) + direction * distance[:, None]
     points[:, 2] = np.maximum(points[:, 2], 0.0)
     return points
 
 
-def _frames(truth: Truth, trajectory: Trajectory, times: Array, world: Array,
-            rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _frames(
+    truth: Truth, trajectory: Trajectory, times: Array, world: Array, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
-    view = View(lambda local: center + truth.focal * local[:, :2] / local[:, 2:],
-                lambda pixels: np.column_stack([(pixels - center) / truth.focal,
-                                                np.ones(len(pixels))]),
-                truth.width, truth.height, truth.readout_time / truth.height, reference_row=0.0)
+    view = View(
+        lambda local: center + truth.focal * local[:, :2] / local[:, 2:],
+        lambda pixels: np.column_stack([(pixels - center) / truth.focal, np.ones(len(pixels))]),
+        truth.width,
+        truth.height,
+        truth.readout_time / truth.height,
+        reference_row=0.0,
+    )
     path = FinePath(trajectory, times[0] - 0.1, times[-1] + 0.15)
-    ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
+    ids = np.full(len(world), -1, dtype=np.int64)  # track of a point that is followed
     drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
     next_id, frame, track, pixels = 0, [], [], []
     for index, time in enumerate(times):
@@ -147,7 +171,7 @@ def _frames(truth: Truth, trajectory: Trajectory, times: Array, world: Array,
         ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
         free = truth.features - int((ids >= 0).sum())
         candidates = np.flatnonzero(visible & (ids < 0))
-        new = rng.permutation(candidates)[:max(free, 0)]
+        new = rng.permutation(candidates)[: max(free, 0)]
         ids[new] = next_id + np.arange(len(new))
         next_id += len(new)
         # Half of the outliers slide over the scene, the others jump from frame to frame.
@@ -155,8 +179,11 @@ def _frames(truth: Truth, trajectory: Trajectory, times: Array, world: Array,
         drift[new] = slides[:, None] * rng.normal(0.0, 80.0, (len(new), 2))
         start[new] = time
         followed = np.flatnonzero(ids >= 0)
-        measured = (points[followed] + drift[followed] * (time - start[followed])[:, None]
-                    + truth.pixel_noise * rng.standard_normal((len(followed), 2)))
+        measured = (
+            points[followed]
+            + drift[followed] * (time - start[followed])[:, None]
+            + truth.pixel_noise * rng.standard_normal((len(followed), 2))
+        )
         jumps = rng.uniform(size=len(followed)) < 0.25 * truth.outliers
         measured[jumps] += rng.uniform(-50.0, 50.0, (int(jumps.sum()), 2))
         frame.append(np.full(len(followed), index))

@@ -24,8 +24,12 @@ from rs_relpose_ros.pipeline.pair import PairResult
 # The algorithms of the paper, by solver: its refinement, and the gyro only derotates rows.
 PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
     name: {'solver': solver, 'refinement': 'alternating', 'use_gyro_rotation': False}
-    for name, solver in (('uniform 9-point', 'uniform_9pt'), ('uniform 11-point', 'uniform_11pt'),
-                         ('5-point on derotated rays', 'angular_5pt'))}
+    for name, solver in (
+        ('uniform 9-point', 'uniform_9pt'),
+        ('uniform 11-point', 'uniform_11pt'),
+        ('5-point on derotated rays', 'angular_5pt'),
+    )
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +41,20 @@ class Score:
     answered: int
     rotation: tuple[float, float]
     translation: tuple[float, float]
-    errors: tuple[PairErrors | None, ...] = ()   # of each pair; None without a pose
+    errors: tuple[PairErrors | None, ...] = ()  # of each pair; None without a pose
 
 
 def score(name: str, errors: Sequence[PairErrors | None], pairs: int | None = None) -> Score:
     """Score from errors, None for a pair without a pose; `pairs`: where not all are among them."""
     known = [error for error in errors if error is not None]
-    return Score(name, len(errors) if pairs is None else pairs, len(known),
-                 median_and_p90([e.rotation_error for e in known]),
-                 median_and_p90([e.translation_error for e in known]), tuple(errors))
+    return Score(
+        name,
+        len(errors) if pairs is None else pairs,
+        len(known),
+        median_and_p90([e.rotation_error for e in known]),
+        median_and_p90([e.translation_error for e in known]),
+        tuple(errors),
+    )
 
 
 def score_of_records(name: str, records: Sequence[PairRecord]) -> Score:
@@ -63,24 +72,33 @@ class LiveComparison:
     """Publications of a live node, and the replay of the frames that it processed."""
 
     node: Score
-    records: list[PairRecord]   # of the replay
-    pairs: list[PairResult]   # of the replay
+    records: list[PairRecord]  # of the replay
+    pairs: list[PairResult]  # of the replay
     truth: TrueTrajectory
     intrinsics: Intrinsics
-    frames: int   # in the bag
-    processed: int   # by the node
-    poses: int   # of both
-    unequal: int   # those that are not bit by bit the same in the two
+    frames: int  # in the bag
+    processed: int  # by the node
+    poses: int  # of both
+    unequal: int  # those that are not bit by bit the same in the two
 
     def opencv_scores(self) -> list[Score]:
         """Scores of OpenCV's estimators on the matches of the replay's poses."""
         answered = [pair for pair in self.pairs if pair.pose]
-        return [best_opencv_score(estimator, answered, self.intrinsics, self.truth)
-                for estimator in methods.OPENCV_ESTIMATORS]
+        return [
+            best_opencv_score(estimator, answered, self.intrinsics, self.truth)
+            for estimator in methods.OPENCV_ESTIMATORS
+        ]
 
 
-def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file: Path,
-                 folder: Path, *, pictures: bool = False) -> LiveComparison:
+def compare_live(
+    table: Path,
+    stamps_file: Path,
+    bag_path: Path,
+    parameter_file: Path,
+    folder: Path,
+    *,
+    pictures: bool = False,
+) -> LiveComparison:
     """Replay into `folder` the frames that a live node processed.
 
     `table`: poses that the node published; `stamps_file`: of the frames that it processed.
@@ -90,13 +108,28 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
     pairs: list[PairResult] = []
     with open_bag(bag_path) as bag:
         topics, truth = _topics_and_truth(bag)
-        outcome = replay_into(folder, bag, topics, read_parameters(parameter_file), stamps=stamps,
-                              pictures=pictures, on_pair=pairs.append)
+        outcome = replay_into(
+            folder,
+            bag,
+            topics,
+            read_parameters(parameter_file),
+            stamps=stamps,
+            pictures=pictures,
+            on_pair=pairs.append,
+        )
     unequal, poses = differing_poses(table, folder / POSES.file)
     assert outcome.intrinsics is not None
-    return LiveComparison(score_of_table('relpose_node, live', table, outcome.records, truth),
-                          outcome.records, pairs, truth, outcome.intrinsics, topics.image.count,
-                          len(stamps), poses, unequal)
+    return LiveComparison(
+        score_of_table('relpose_node, live', table, outcome.records, truth),
+        outcome.records,
+        pairs,
+        truth,
+        outcome.intrinsics,
+        topics.image.count,
+        len(stamps),
+        poses,
+        unequal,
+    )
 
 
 def _topics_and_truth(bag: Bag) -> tuple[SensorTopics, TrueTrajectory]:
@@ -111,12 +144,14 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
     """Score of a bag's replay with other parameters, nothing written."""
     with open_bag(bag_path) as bag:
         topics, truth = _topics_and_truth(bag)
-        return score_of_records(name, [
-            PairRecord.of(pair, truth) for pair in Replay(bag, topics, parameters).pairs()])
+        return score_of_records(
+            name, [PairRecord.of(pair, truth) for pair in Replay(bag, topics, parameters).pairs()]
+        )
 
 
-def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
-                   truth: TrueTrajectory) -> Score:
+def score_of_table(
+    name: str, path: Path, pairs: Sequence[PairRecord], truth: TrueTrajectory
+) -> Score:
     """Score of a live node's table; `pairs`: of a replay of its frames."""
     times = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2) for r in pairs}
     errors = []
@@ -135,20 +170,40 @@ def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
 
     A pose that only one of the two has counts as different.
     """
-    columns = ('tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1', 'sigma_t2', 'sigma_rx',
-               'sigma_ry', 'sigma_rz', 'inliers')
+    columns = (
+        'tx',
+        'ty',
+        'tz',
+        'qx',
+        'qy',
+        'qz',
+        'qw',
+        'sigma_t1',
+        'sigma_t2',
+        'sigma_rx',
+        'sigma_ry',
+        'sigma_rz',
+        'inliers',
+    )
     tables = []
     for path in (live, replayed):
         with path.open(newline='', encoding='ascii') as file:
-            tables.append({(row['reference_stamp_ns'], row['stamp_ns']):
-                           [row[column] for column in columns]
-                           for row in csv.DictReader(file) if row['status'] == Status.OK.value})
+            tables.append(
+                {
+                    (row['reference_stamp_ns'], row['stamp_ns']): [
+                        row[column] for column in columns
+                    ]
+                    for row in csv.DictReader(file)
+                    if row['status'] == Status.OK.value
+                }
+            )
     keys = tables[0].keys() | tables[1].keys()
     return sum(tables[0].get(key) != tables[1].get(key) for key in keys), len(keys)
 
 
-def best_opencv_score(estimator: str, pairs: Sequence[PairResult], intrinsics: Intrinsics,
-                      truth: TrueTrajectory) -> Score:
+def best_opencv_score(
+    estimator: str, pairs: Sequence[PairResult], intrinsics: Intrinsics, truth: TrueTrajectory
+) -> Score:
     """Score of an OpenCV estimator at the best of three thresholds.
 
     Best in the median rotation error against the truth, which favours the baseline. `pairs`: those
@@ -157,32 +212,39 @@ def best_opencv_score(estimator: str, pairs: Sequence[PairResult], intrinsics: I
     scores = []
     for threshold in (0.5, 1.0, 2.0):
         poses = [opencv_pose(pair, intrinsics, threshold, estimator) for pair in pairs]
-        errors = [truth.errors(pose.R, pose.t, pair.reference_ns1,
-                               pair.reference_ns2) if pose else None
-                  for pair, pose in zip(pairs, poses, strict=True)]
+        errors = [
+            truth.errors(pose.R, pose.t, pair.reference_ns1, pair.reference_ns2) if pose else None
+            for pair, pose in zip(pairs, poses, strict=True)
+        ]
         scores.append(score(f'OpenCV 5-point, {estimator}, {threshold:g} px', errors))
     return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))
 
 
-def opencv_pose(pair: PairResult, intrinsics: Intrinsics, threshold: float,
-                estimator: str = 'USAC_MAGSAC') -> methods.Pose | None:
+def opencv_pose(
+    pair: PairResult, intrinsics: Intrinsics, threshold: float, estimator: str = 'USAC_MAGSAC'
+) -> methods.Pose | None:
     """Pose by an OpenCV estimator from the matches of a pair, as of a global shutter."""
     camera = intrinsics.global_shutter_camera()
-    pixels1, pixels2 = (methods.undistorted(intrinsics.to_sensor(points), camera) for points in
-                        (pair.matches.points1, pair.matches.points2))
+    pixels1, pixels2 = (
+        methods.undistorted(intrinsics.to_sensor(points), camera)
+        for points in (pair.matches.points1, pair.matches.points2)
+    )
     return methods.opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
 
 
 def score_table(scores: Sequence[Score]) -> list[str]:
     """Lines of a table of scores, two of them its head."""
     width = max(len(s.name) for s in scores)
-    lines = [f'{"":{width}}                    rotation error     translation error',
-             f'{"":{width}}                         [deg]         (direction) [deg]',
-             f'{"":{width}}  pairs  poses    median     90 %    median     90 %']
+    lines = [
+        f'{"":{width}}                    rotation error     translation error',
+        f'{"":{width}}                         [deg]         (direction) [deg]',
+        f'{"":{width}}  pairs  poses    median     90 %    median     90 %',
+    ]
     lines.append('-' * len(lines[-1]))
     for s in scores:
-        errors = '  '.join(f'{_cell(median)} {_cell(p90)}'
-                           for median, p90 in (s.rotation, s.translation))
+        errors = '  '.join(
+            f'{_cell(median)} {_cell(p90)}' for median, p90 in (s.rotation, s.translation)
+        )
         lines.append(f'{s.name:{width}}  {s.pairs:5d}  {s.answered:5d}  {errors}')
     return lines
 

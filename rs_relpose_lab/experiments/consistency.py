@@ -89,35 +89,56 @@ class PairConsistency:
         return 'short' if self.interval < SHORT else 'long'
 
 
-def pair_consistency(source: str, bag: str, true: TruePair,
-                     pose: RelativePose | Pose | None) -> PairConsistency:
+def pair_consistency(
+    source: str, bag: str, true: TruePair, pose: RelativePose | Pose | None
+) -> PairConsistency:
     """Compare an estimate, if there is one, with the truth and its covariance."""
-    found = PairConsistency(source, bag, true.stamp1_ns, true.stamp2_ns,
-                            seconds_between(true.stamp1_ns, true.stamp2_ns))
+    found = PairConsistency(
+        source,
+        bag,
+        true.stamp1_ns,
+        true.stamp2_ns,
+        seconds_between(true.stamp1_ns, true.stamp2_ns),
+    )
     if not pose:
         return found
     error = pose_error(pose.R, pose.t, true.R, true.t)
     found = replace(found, rotation=error.rotation, translation=error.translation)
     if pose.covariance is None:
         return found
-    nees = chi_squares(pose.R, pose.t, true.R, true.t, pose.covariance + np.diag(
-        np.repeat([true.t_sigma**2, true.R_sigma**2], 3)))
-    return replace(found, rotation_nees=nees.rotation / R_FREEDOM,
-                   translation_nees=nees.translation / T_FREEDOM)
+    nees = chi_squares(
+        pose.R,
+        pose.t,
+        true.R,
+        true.t,
+        pose.covariance + np.diag(np.repeat([true.t_sigma**2, true.R_sigma**2], 3)),
+    )
+    return replace(
+        found,
+        rotation_nees=nees.rotation / R_FREEDOM,
+        translation_nees=nees.translation / T_FREEDOM,
+    )
 
 
-def configurations(bags: int, first_seed: int,
-                   exposure_time: float = 0.0) -> list[SimulationConfig]:
+def configurations(
+    bags: int, first_seed: int, exposure_time: float = 0.0
+) -> list[SimulationConfig]:
     """Walks of 6 s: scenes alternate, readouts from 12 to 35 ms and noises are drawn."""
     configs = []
     for seed in range(first_seed, first_seed + bags):
         rng = np.random.default_rng(seed)
-        configs.append(SimulationConfig(
-            seed=seed, scene=SCENES[seed % len(SCENES)], duration=6.0,
-            plan='walk:6.0' if seed % 2 else '', readout_time=round(rng.uniform(0.012, 0.035), 4),
-            exposure_time=exposure_time,
-            pixel_noise=float(rng.choice([0.5, 1.0, 2.0, 4.0])),
-            gyro_noise_density=float(rng.choice([1e-4, 1.7e-4, 3.4e-4]))))
+        configs.append(
+            SimulationConfig(
+                seed=seed,
+                scene=SCENES[seed % len(SCENES)],
+                duration=6.0,
+                plan='walk:6.0' if seed % 2 else '',
+                readout_time=round(rng.uniform(0.012, 0.035), 4),
+                exposure_time=exposure_time,
+                pixel_noise=float(rng.choice([0.5, 1.0, 2.0, 4.0])),
+                gyro_noise_density=float(rng.choice([1e-4, 1.7e-4, 3.4e-4])),
+            )
+        )
     return configs
 
 
@@ -127,12 +148,14 @@ def on_simulated_bag(config: SimulationConfig, folder: Path) -> Iterator[PairCon
     parameters = read_parameters(parameter_file)
     name = f'{config.scene} {config.seed}, {1e3 * config.readout_time:.0f} ms'
     for parallax in PARALLAXES:
-        yield from replayed(path, parameters.updated({'min_keyframe_parallax': parallax}),
-                            SIMULATED, name)
+        yield from replayed(
+            path, parameters.updated({'min_keyframe_parallax': parallax}), SIMULATED, name
+        )
 
 
-def replayed(path: Path, parameters: Parameters, source: str,
-             name: str) -> Iterator[PairConsistency]:
+def replayed(
+    path: Path, parameters: Parameters, source: str, name: str
+) -> Iterator[PairConsistency]:
     """Pairs of a simulated bag, without those at rest."""
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
@@ -141,8 +164,12 @@ def replayed(path: Path, parameters: Parameters, source: str,
         for result in Replay(bag, topics, parameters).pairs():
             known = truth.relative_pose(result.reference_ns1, result.reference_ns2)
             if known and np.linalg.norm(known[1]) > STILL:
-                yield pair_consistency(source, name, TruePair(
-                    result.reference_stamp_ns, result.stamp_ns, *known), result.pose)
+                yield pair_consistency(
+                    source,
+                    name,
+                    TruePair(result.reference_stamp_ns, result.stamp_ns, *known),
+                    result.pose,
+                )
 
 
 def read_true_pairs(path: Path) -> list[TruePair]:
@@ -155,18 +182,24 @@ def read_true_pairs(path: Path) -> list[TruePair]:
     with path.open(newline='', encoding='utf-8') as file:
         rows = list(csv.DictReader(file))
     try:
-        return [TruePair(
-            int(row['stamp1_ns']), int(row['stamp2_ns']),
-            np.array([[float(row[f'r{i}{j}']) for j in (1, 2, 3)] for i in (1, 2, 3)]),
-            np.array([float(row[f't{axis}']) for axis in 'xyz']),
-            math.radians(float(row['sigma_t_deg'])),
-            math.radians(float(row['sigma_r_deg'])) / math.sqrt(3.0)) for row in rows]
+        return [
+            TruePair(
+                int(row['stamp1_ns']),
+                int(row['stamp2_ns']),
+                np.array([[float(row[f'r{i}{j}']) for j in (1, 2, 3)] for i in (1, 2, 3)]),
+                np.array([float(row[f't{axis}']) for axis in 'xyz']),
+                math.radians(float(row['sigma_t_deg'])),
+                math.radians(float(row['sigma_r_deg'])) / math.sqrt(3.0),
+            )
+            for row in rows
+        ]
     except (KeyError, ValueError) as error:
         raise InputError(f'{path} is no table of true pairs: {error}') from error
 
 
-def on_recording(path: Path, parameter_file: Path, truth: Path, *,
-                 compare: bool = False) -> Iterator[PairConsistency]:
+def on_recording(
+    path: Path, parameter_file: Path, truth: Path, *, compare: bool = False
+) -> Iterator[PairConsistency]:
     """The true pairs of a recording, as a node publishes them that has run from its begin.
 
     `compare`: also with a readout time of 0, and OpenCV's 5-point on the same matches.
@@ -178,8 +211,10 @@ def on_recording(path: Path, parameter_file: Path, truth: Path, *,
         methods[MAGSAC] = lambda pair, lens: opencv_pose(pair, lens, THRESHOLD)
         runs.append((parameters.updated(IGNORE_READOUT), {NO_READOUT: methods[RECORDED]}))
     for (configured, methods), apart in itertools.product(runs, _passes(pairs)):
-        found = {(pair.reference_stamp_ns, pair.stamp_ns): (pair, lens) for pair, lens in
-                 chosen_pairs(path, configured, [true[:2] for true in apart])}
+        found = {
+            (pair.reference_stamp_ns, pair.stamp_ns): (pair, lens)
+            for pair, lens in chosen_pairs(path, configured, [true[:2] for true in apart])
+        }
         for true, (name, pose_of) in itertools.product(apart, methods.items()):
             given = found.get(true[:2])
             yield pair_consistency(name, path.name, true, pose_of(*given) if given else None)
@@ -196,8 +231,9 @@ def _passes(pairs: Sequence[TruePair]) -> list[list[TruePair]]:
     return groups
 
 
-def chosen_pairs(path: Path, parameters: Parameters,
-                 ends: Sequence[tuple[int, int]]) -> Iterator[tuple[PairResult, Intrinsics]]:
+def chosen_pairs(
+    path: Path, parameters: Parameters, ends: Sequence[tuple[int, int]]
+) -> Iterator[tuple[PairResult, Intrinsics]]:
     """Pairs with given ends, amid those of the keyframe policy, of one run over a recording.
 
     `ends`: stamps of both images [ns], in the order of time and without overlap. A pair in which
@@ -206,18 +242,27 @@ def chosen_pairs(path: Path, parameters: Parameters,
     following = dict(itertools.pairwise([0, *image_stamps(path)]))
     keyframes, wanted = frozenset(itertools.chain.from_iterable(ends)), set(ends)
     within = {s for s in following if any(begin < s < end for begin, end in ends)}
-    at_once, never = (parameters.updated(policy) for policy in (
-        {'max_keyframe_frames': 1},
-        {'min_keyframe_parallax': 1000.0, 'max_keyframe_interval': 60.0,
-         'min_tracked_fraction': 0.0, 'max_keyframe_frames': 1000}))
+    at_once, never = (
+        parameters.updated(policy)
+        for policy in (
+            {'max_keyframe_frames': 1},
+            {
+                'min_keyframe_parallax': 1000.0,
+                'max_keyframe_interval': 60.0,
+                'min_tracked_fraction': 0.0,
+                'max_keyframe_frames': 1000,
+            },
+        )
+    )
     front_end = FrontEnd(parameters, offline=True)
     intake = incoming.Intake(front_end.sequencer, parameters)
 
     def prepare_for(stamp: int | None) -> None:
-        front_end.parameters = (at_once if stamp in keyframes else
-                                never if stamp in within else parameters)
+        front_end.parameters = (
+            at_once if stamp in keyframes else never if stamp in within else parameters
+        )
 
-    done = 0   # stamp of the last image that was processed or refused
+    done = 0  # stamp of the last image that was processed or refused
     prepare_for(following.get(done))
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
@@ -226,8 +271,11 @@ def chosen_pairs(path: Path, parameters: Parameters,
                 raise outcome.error
             done = outcome.stamp_ns or done
             prepare_for(following.get(done))
-            if isinstance(outcome, Frame) and outcome.result is not None and (
-                    outcome.result.reference_stamp_ns, outcome.result.stamp_ns) in wanted:
+            if (
+                isinstance(outcome, Frame)
+                and outcome.result is not None
+                and (outcome.result.reference_stamp_ns, outcome.result.stamp_ns) in wanted
+            ):
                 yield outcome.result, outcome.intrinsics
             if done >= ends[-1][1]:
                 return
@@ -237,37 +285,68 @@ def image_stamps(path: Path) -> list[int]:
     """Stamps of all images of a bag [ns]."""
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=False)
-        return [incoming.image_from_message(message.message).stamp_ns
-                for _, message in incoming.sensor_messages(bag, topics, (incoming.Role.IMAGE,))]
+        return [
+            incoming.image_from_message(message.message).stamp_ns
+            for _, message in incoming.sensor_messages(bag, topics, (incoming.Role.IMAGE,))
+        ]
 
 
 def write_report(folder: Path, pairs: Sequence[PairConsistency]) -> str:
     """Write the pairs (CSV) and the report (Markdown), and return the latter."""
     keys: list[Callable[[PairConsistency], str]] = [
-        lambda p: f'{p.bag}, {p.span}, {p.source}', lambda p: f'{p.source}, {p.span}',
-        lambda p: p.source]
-    return write_table(folder, 'consistency', pairs, markdown_table(
-        ('bag, span', 'poses of pairs', 'interval [s]', 'R [deg]', 't [deg]', 'NEES of R: median',
-         'mean', 'beyond 99.7 %', 'NEES of t: median', 'mean', 'beyond 99.7 %'),
-        [_line(*group) for key in keys for group in grouped(pairs, key).items()]))
+        lambda p: f'{p.bag}, {p.span}, {p.source}',
+        lambda p: f'{p.source}, {p.span}',
+        lambda p: p.source,
+    ]
+    return write_table(
+        folder,
+        'consistency',
+        pairs,
+        markdown_table(
+            (
+                'bag, span',
+                'poses of pairs',
+                'interval [s]',
+                'R [deg]',
+                't [deg]',
+                'NEES of R: median',
+                'mean',
+                'beyond 99.7 %',
+                'NEES of t: median',
+                'mean',
+                'beyond 99.7 %',
+            ),
+            [_line(*group) for key in keys for group in grouped(pairs, key).items()],
+        ),
+    )
 
 
 def _line(name: str, pairs: Sequence[PairConsistency]) -> tuple[str, ...]:
     """Errors: median / 90 %; NEES by their expectation: its median by that of chi^2."""
     answered = [p for p in pairs if not math.isnan(p.rotation)]
-    cells = [name, f'{len(answered)} of {len(pairs)}',
-             f'{np.median([p.interval for p in pairs]):.2f}']
+    cells = [
+        name,
+        f'{len(answered)} of {len(pairs)}',
+        f'{np.median([p.interval for p in pairs]):.2f}',
+    ]
     if not answered:
         return (*cells, *8 * ('-',))
-    for digits, errors in ((3, [p.rotation for p in answered]),
-                           (2, [p.translation for p in answered])):
+    for digits, errors in (
+        (3, [p.rotation for p in answered]),
+        (2, [p.translation for p in answered]),
+    ):
         cells.append(' / '.join(f'{e:.{digits}f}' for e in np.percentile(errors, (50, 90))))
-    for freedom, values in ((R_FREEDOM, [p.rotation_nees for p in answered]),
-                            (T_FREEDOM, [p.translation_nees for p in answered])):
+    for freedom, values in (
+        (R_FREEDOM, [p.rotation_nees for p in answered]),
+        (T_FREEDOM, [p.translation_nees for p in answered]),
+    ):
         law, squares = chi2(freedom), freedom * np.array(values)
-        if np.isnan(squares).all():   # a method without covariance
+        if np.isnan(squares).all():  # a method without covariance
             cells += 3 * ['-']
             continue
-        cells += [f'{np.median(squares) / law.median():.2f}', f'{squares.mean() / freedom:.2f}',
-                  f'{np.mean(squares > law.ppf(QUANTILE)):.1%}']
+        cells += [
+            f'{np.median(squares) / law.median():.2f}',
+            f'{squares.mean() / freedom:.2f}',
+            f'{np.mean(squares > law.ppf(QUANTILE)):.1%}',
+        ]
     return tuple(cells)

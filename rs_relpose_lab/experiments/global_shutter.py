@@ -57,12 +57,12 @@ class MapErrors:
 
     name: str
     readout_ms: float
-    rate: float   # [rad/s] largest
-    left: float   # from the map to the true sources
+    rate: float  # [rad/s] largest
+    left: float  # from the map to the true sources
     left_p90: float
-    predicted: float   # from the true sources to those of rotation alone
+    predicted: float  # from the true sources to those of rotation alone
     predicted_p90: float
-    map: float   # from the latter to the map
+    map: float  # from the latter to the map
     map_p90: float
 
 
@@ -82,26 +82,36 @@ def configured(simulation: Simulation) -> Parameters:
     return Parameters.from_mapping(right_parameters(simulation))
 
 
-def derotated_frames(simulation: Simulation, parameters: Parameters, *,
-                     images: bool = False) -> Iterator[tuple[int, GlobalShutterFrame]]:
+def derotated_frames(
+    simulation: Simulation, parameters: Parameters, *, images: bool = False
+) -> Iterator[tuple[int, GlobalShutterFrame]]:
     """Number and derotated frame of each image; black images where none are rendered."""
     config, camera = simulation.config, simulation.camera
     loop = unrolling_loop(parameters, offline=True)
     samples, fed = simulation.imu.samples(), 0
     black = np.zeros((config.height, config.width), dtype=np.uint8)
     for index in range(config.frame_count):
-        until = int(np.searchsorted(simulation.imu.stamps_ns, simulation.reference_ns(index)
-                                    + to_nanoseconds(camera.row_time_span[1] + _AHEAD)))
+        until = int(
+            np.searchsorted(
+                simulation.imu.stamps_ns,
+                simulation.reference_ns(index) + to_nanoseconds(camera.row_time_span[1] + _AHEAD),
+            )
+        )
         for sample in samples[fed:until]:
             loop.sequencer.add_imu(sample)
         fed = until
         pixels = simulation.image(index) if images else black
-        yield index, _derotated(loop, RawImage.of_gray(pixels, simulation.stamp_ns(index)),
-                                intrinsics_of(camera))
+        yield (
+            index,
+            _derotated(
+                loop, RawImage.of_gray(pixels, simulation.stamp_ns(index)), intrinsics_of(camera)
+            ),
+        )
 
 
-def _derotated(loop: FrameLoop[GlobalShutterFrame], image: RawImage,
-               intrinsics: Intrinsics) -> GlobalShutterFrame:
+def _derotated(
+    loop: FrameLoop[GlobalShutterFrame], image: RawImage, intrinsics: Intrinsics
+) -> GlobalShutterFrame:
     """The next frame through the loop; the IMU already covers its rows."""
     loop.sequencer.add_frame(image, intrinsics)
     outcome = loop.step()
@@ -110,16 +120,21 @@ def _derotated(loop: FrameLoop[GlobalShutterFrame], image: RawImage,
     return outcome.result
 
 
-def map_errors(name: str, config: SimulationConfig,
-               trajectory: Trajectory | None = None) -> MapErrors:
+def map_errors(
+    name: str, config: SimulationConfig, trajectory: Trajectory | None = None
+) -> MapErrors:
     """Compare the maps of all frames of a recording with the truth."""
     simulation = simulate(config, trajectory=trajectory)
     camera = simulation.camera
     # The same camera with all rows read at the time of the middle one.
     still = replace(simulation.renderer, camera=replace(camera, readout_time=0.0))
     middle_row = float(camera.row_times(0.5 * (camera.height - 1)))
-    points = np.stack(np.meshgrid(np.arange(0.0, config.width, _SPACING),
-                                  np.arange(0.0, config.height, _SPACING)), -1).reshape(-1, 2)
+    points = np.stack(
+        np.meshgrid(
+            np.arange(0.0, config.width, _SPACING), np.arange(0.0, config.height, _SPACING)
+        ),
+        -1,
+    ).reshape(-1, 2)
     columns, rows = points.astype(int).T
     distances, rate = [], 0.0
     for index, derotated in derotated_frames(simulation, configured(simulation)):
@@ -130,20 +145,51 @@ def map_errors(name: str, config: SimulationConfig,
         by_rotation = _observed_by_rotation(simulation, reference, world, middle)
         sources = np.concatenate([band for _, band in derotated.map.bands()])
         by_map = sources[rows, columns]
-        rate = max(rate, float(np.linalg.norm(simulation.trajectory.states(
-            reference + np.asarray(camera.row_time_span)).angular_velocity, axis=1).max()))
-        distances.append(np.stack([np.linalg.norm(difference, axis=1) for difference in (
-            observed - by_map, observed - by_rotation, by_rotation - by_map)], axis=1))
+        rate = max(
+            rate,
+            float(
+                np.linalg.norm(
+                    simulation.trajectory.states(
+                        reference + np.asarray(camera.row_time_span)
+                    ).angular_velocity,
+                    axis=1,
+                ).max()
+            ),
+        )
+        distances.append(
+            np.stack(
+                [
+                    np.linalg.norm(difference, axis=1)
+                    for difference in (
+                        observed - by_map,
+                        observed - by_rotation,
+                        by_rotation - by_map,
+                    )
+                ],
+                axis=1,
+            )
+        )
     all_distances = np.concatenate(distances)
     known = all_distances[np.isfinite(all_distances).all(axis=1)]
     (left, predicted, of_map), (left90, predicted90, of_map90) = np.percentile(
-        known, (50, 90), axis=0)
-    return MapErrors(name, 1e3 * config.readout_time, rate, left, left90, predicted, predicted90,
-                     of_map, of_map90)
+        known, (50, 90), axis=0
+    )
+    return MapErrors(
+        name,
+        1e3 * config.readout_time,
+        rate,
+        left,
+        left90,
+        predicted,
+        predicted90,
+        of_map,
+        of_map90,
+    )
 
 
-def _observed_by_rotation(simulation: Simulation, reference: float, world: Array,
-                          middle: float) -> Array:
+def _observed_by_rotation(
+    simulation: Simulation, reference: float, world: Array, middle: float
+) -> Array:
     """Pixels of world points for a camera that rotates only, at its position of `middle`."""
     centre, _ = simulation.trajectory.poses([middle])
 
@@ -165,13 +211,15 @@ def map_cases(walks: int, first_seed: int) -> list[Case]:
         config = SimulationConfig(seed=first_seed, duration=2.0, readout_direction=direction)
         cases.append((f'swing {rate:g} rad/s, read {direction}', config, swinging(rate, 2.0)))
     for seed in range(first_seed, first_seed + walks):
-        config = SimulationConfig(seed=seed, scene=SCENES[seed % len(SCENES)], duration=2.0,
-                                  plan='walk:2.0')
+        config = SimulationConfig(
+            seed=seed, scene=SCENES[seed % len(SCENES)], duration=2.0, plan='walk:2.0'
+        )
         cases.append((f'walk {config.scene} {seed}', config, None))
     return cases
 
 
 # -- OpenCV's 5-point on raw and derotated images ---------------------------------------------
+
 
 @dataclass(frozen=True, slots=True)
 class FivePoint:
@@ -206,9 +254,16 @@ def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
     parameters = read_parameters(parameter_file)
     raw = five_point(path, parameters)
     corrected = five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters))
-    return FivePoint(f'{config.scene} {config.seed}', 1e3 * config.readout_time,
-                     raw.answered, raw.rotation[0], raw.translation[0],
-                     corrected.answered, corrected.rotation[0], corrected.translation[0])
+    return FivePoint(
+        f'{config.scene} {config.seed}',
+        1e3 * config.readout_time,
+        raw.answered,
+        raw.rotation[0],
+        raw.translation[0],
+        corrected.answered,
+        corrected.rotation[0],
+        corrected.translation[0],
+    )
 
 
 def _unrolled(path: Path, parameters: Parameters, folder: Path) -> Path:
@@ -222,8 +277,15 @@ def _unrolled(path: Path, parameters: Parameters, folder: Path) -> Path:
 
 def as_global_shutter(parameters: Parameters) -> Parameters:
     """Parameters for the derotated images of a camera, stamped on the IMU's clock."""
-    return parameters.updated({'readout_time': 0.0, 'time_offset': 0.0, 'stamp_row': 'first',
-                               'time_offset_per_interval': 0.0, 'stamp_exposure': 'middle'})
+    return parameters.updated(
+        {
+            'readout_time': 0.0,
+            'time_offset': 0.0,
+            'stamp_row': 'first',
+            'time_offset_per_interval': 0.0,
+            'stamp_exposure': 'middle',
+        }
+    )
 
 
 def five_point(path: Path, parameters: Parameters) -> Score:
@@ -239,23 +301,36 @@ def five_point(path: Path, parameters: Parameters) -> Score:
             if pair.pose and known and np.linalg.norm(known[1]) > STILL:
                 pairs.append(pair)
         assert replay.intake.intrinsics is not None
-    return min((best_opencv_score(estimator, pairs, replay.intake.intrinsics, truth)
-                for estimator in OPENCV_ESTIMATORS), key=lambda found: found.rotation[0])
+    return min(
+        (
+            best_opencv_score(estimator, pairs, replay.intake.intrinsics, truth)
+            for estimator in OPENCV_ESTIMATORS
+        ),
+        key=lambda found: found.rotation[0],
+    )
 
 
 def five_point_when_derotated(path: Path, parameters: Parameters, folder: Path) -> Score:
     """Score of OpenCV on the derotated images of a bag, which are written into `folder`."""
     shutil.rmtree(folder / f'{path.name}_derotated', ignore_errors=True)
-    return replace(five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters)),
-                   name='OpenCV 5-point, derotated')
+    return replace(
+        five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters)),
+        name='OpenCV 5-point, derotated',
+    )
 
 
 def bag_configurations(bags: int, first_seed: int) -> list[SimulationConfig]:
     """Walks of 6 s; scenes in rotation, readouts are spread from 15 to 35 ms."""
-    return [SimulationConfig(seed=seed, scene=SCENES[seed % len(SCENES)], duration=6.0,
-                             plan='walk:6.0',
-                             readout_time=round(0.015 + 0.02 * k / max(bags - 1, 1), 4))
-            for k, seed in enumerate(range(first_seed, first_seed + bags))]
+    return [
+        SimulationConfig(
+            seed=seed,
+            scene=SCENES[seed % len(SCENES)],
+            duration=6.0,
+            plan='walk:6.0',
+            readout_time=round(0.015 + 0.02 * k / max(bags - 1, 1), 4),
+        )
+        for k, seed in enumerate(range(first_seed, first_seed + bags))
+    ]
 
 
 # -- time and report --------------------------------------------------------------------------
@@ -279,20 +354,35 @@ class Speed:
 def frame_times(width: int, height: int) -> Speed:
     """Derotate frames of noise, from the mailbox to the pixels, on one core."""
     cv2.setNumThreads(1)
-    intrinsics = intrinsics_of(RollingShutterCamera(
-        width=width, height=height, fx=0.7 * width, fy=0.7 * width, cx=0.5 * width,
-        cy=0.5 * height, distortion=(-0.12, 0.05, 8e-4, -5e-4, 0.0), readout_time=0.03))
-    loop = unrolling_loop(Parameters.from_mapping(
-        {'readout_time': 0.03, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
+    intrinsics = intrinsics_of(
+        RollingShutterCamera(
+            width=width,
+            height=height,
+            fx=0.7 * width,
+            fy=0.7 * width,
+            cx=0.5 * width,
+            cy=0.5 * height,
+            distortion=(-0.12, 0.05, 8e-4, -5e-4, 0.0),
+            readout_time=0.03,
+        )
+    )
+    loop = unrolling_loop(
+        Parameters.from_mapping({'readout_time': 0.03, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}),
+        offline=True,
+    )
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, width * height, dtype=np.uint8).reshape(height, width)
     times, stamp_ns = [], 0
     for frame in range(1, _FRAMES + 1):
         while stamp_ns < frame * _FRAME_NS + NANOSECONDS // 25:
             rate = 2.0 * np.sin(1e-9 * stamp_ns * np.array([7.0, 5.0, 3.0]))
-            loop.sequencer.add_imu(ImuSample(
-                stamp_ns, tuple((rate + 1e-3 * rng.standard_normal(3)).tolist()),
-                (0.0, -9.81, 0.0)))
+            loop.sequencer.add_imu(
+                ImuSample(
+                    stamp_ns,
+                    tuple((rate + 1e-3 * rng.standard_normal(3)).tolist()),
+                    (0.0, -9.81, 0.0),
+                )
+            )
             stamp_ns += _IMU_NS
         started = time.thread_time()
         _derotated(loop, RawImage.of_gray(image, frame * _FRAME_NS), intrinsics).image()
@@ -301,34 +391,81 @@ def frame_times(width: int, height: int) -> Speed:
     return Speed(width, height, *map(float, np.percentile(times[1:], (50, 90))))
 
 
-def write_report(folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoint],
-                 speeds: Sequence[Speed]) -> str:
+def write_report(
+    folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoint], speeds: Sequence[Speed]
+) -> str:
     """Write the data (CSV) and the report (Markdown), and return the latter."""
     parts = []
     if maps:
         write_csv(folder / 'map.csv', maps)
-        parts.append('Sources of pixels [px], median / 90 %\n\n' + markdown_table(
-            ('recording', 'readout [ms]', 'largest rate [rad/s]', 'map to truth',
-             'shift by translation', 'map to rotation alone'),
-            [(m.name, f'{m.readout_ms:.0f}', f'{m.rate:.1f}', f'{m.left:.3f} / {m.left_p90:.3f}',
-              f'{m.predicted:.3f} / {m.predicted_p90:.3f}', f'{m.map:.3f} / {m.map_p90:.3f}')
-             for m in maps]))
+        parts.append(
+            'Sources of pixels [px], median / 90 %\n\n'
+            + markdown_table(
+                (
+                    'recording',
+                    'readout [ms]',
+                    'largest rate [rad/s]',
+                    'map to truth',
+                    'shift by translation',
+                    'map to rotation alone',
+                ),
+                [
+                    (
+                        m.name,
+                        f'{m.readout_ms:.0f}',
+                        f'{m.rate:.1f}',
+                        f'{m.left:.3f} / {m.left_p90:.3f}',
+                        f'{m.predicted:.3f} / {m.predicted_p90:.3f}',
+                        f'{m.map:.3f} / {m.map_p90:.3f}',
+                    )
+                    for m in maps
+                ],
+            )
+        )
     if bags:
         write_csv(folder / 'five_point.csv', bags)
-        rows = [(b.name, f'{b.readout_ms:.0f}', f'{b.raw_rotation:.3f}',
-                 f'{b.raw_translation:.2f}', f'{b.derotated_rotation:.3f}',
-                 f'{b.derotated_translation:.2f}', f'{b.rotation_ratio:.1f}',
-                 f'{b.translation_ratio:.1f}') for b in bags]
-        parts.append("OpenCV's 5-point, median errors [deg]\n\n" + markdown_table(
-            ('recording', 'readout [ms]', 'raw: R', 't', 'derotated: R', 't', 'ratio of R',
-             'of t'), rows))
-        parts.append('Median of the ratios: rotation '
-                     f'{statistics.median(b.rotation_ratio for b in bags):.1f}, translation '
-                     f'{statistics.median(b.translation_ratio for b in bags):.1f}\n')
+        rows = [
+            (
+                b.name,
+                f'{b.readout_ms:.0f}',
+                f'{b.raw_rotation:.3f}',
+                f'{b.raw_translation:.2f}',
+                f'{b.derotated_rotation:.3f}',
+                f'{b.derotated_translation:.2f}',
+                f'{b.rotation_ratio:.1f}',
+                f'{b.translation_ratio:.1f}',
+            )
+            for b in bags
+        ]
+        parts.append(
+            "OpenCV's 5-point, median errors [deg]\n\n"
+            + markdown_table(
+                (
+                    'recording',
+                    'readout [ms]',
+                    'raw: R',
+                    't',
+                    'derotated: R',
+                    't',
+                    'ratio of R',
+                    'of t',
+                ),
+                rows,
+            )
+        )
+        parts.append(
+            'Median of the ratios: rotation '
+            f'{statistics.median(b.rotation_ratio for b in bags):.1f}, translation '
+            f'{statistics.median(b.translation_ratio for b in bags):.1f}\n'
+        )
     write_csv(folder / 'speed.csv', speeds)
-    parts.append('Processor time of a frame [ms]\n\n' + markdown_table(
-        ('size', 'median', '90 %'),
-        [(f'{s.width}x{s.height} mono8', f'{s.median:.1f}', f'{s.p90:.1f}') for s in speeds]))
+    parts.append(
+        'Processor time of a frame [ms]\n\n'
+        + markdown_table(
+            ('size', 'median', '90 %'),
+            [(f'{s.width}x{s.height} mono8', f'{s.median:.1f}', f'{s.p90:.1f}') for s in speeds],
+        )
+    )
     text = '\n'.join(parts)
     (folder / 'global_shutter.md').write_text(text, encoding='utf-8')
     return text

@@ -28,8 +28,10 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
 
     def padded(line: Sequence[str]) -> str:
-        cells = [line[0].ljust(widths[0]),
-                 *(text.rjust(width) for text, width in zip(line[1:], widths[1:], strict=True))]
+        cells = [
+            line[0].ljust(widths[0]),
+            *(text.rjust(width) for text, width in zip(line[1:], widths[1:], strict=True)),
+        ]
         return '| ' + ' | '.join(cells) + ' |'
 
     rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
@@ -41,8 +43,10 @@ def write_csv(path: Path, records: Iterable[Any]) -> None:
 
     A dataclass inside of another gives columns ``outer_inner``.
     """
-    rows = [dict(_flat(record if isinstance(record, Mapping) else asdict(record)))
-            for record in records]
+    rows = [
+        dict(_flat(record if isinstance(record, Mapping) else asdict(record)))
+        for record in records
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open('w', newline='', encoding='utf-8') as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -74,8 +78,12 @@ def use_one_thread() -> None:
         os.environ[f'{name}_NUM_THREADS'] = '1'
 
 
-def in_processes(work: Callable[[_Task], _Result], tasks: Sequence[_Task], jobs: int,
-                 prepare: Callable[[], object] | None = None) -> Iterator[_Result]:
+def in_processes(
+    work: Callable[[_Task], _Result],
+    tasks: Sequence[_Task],
+    jobs: int,
+    prepare: Callable[[], object] | None = None,
+) -> Iterator[_Result]:
     """Results of `work`, in the order of the tasks, which does not depend on `jobs`.
 
     `prepare` is called once in each process.

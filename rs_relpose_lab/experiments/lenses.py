@@ -30,7 +30,7 @@ from rs_relpose_ros.messages.incoming import Role, sensor_messages, stamp_ns
 MODELS = {'plumb_bob': (-0.2, 0.1), 'equidistant': (-0.05, 0.05)}
 # Focal length over that assumed by `calibrate`, 0.8 widths; error of the principal point [px].
 FOCAL, CENTER = (0.8, 1.2), 10.0
-LENS = ('focal length [%]', 'first coefficient', 'principal point [px]')   # the larger of both
+LENS = ('focal length [%]', 'first coefficient', 'principal point [px]')  # the larger of both
 # Largest rotation of the IMU about each axis, from one of the 24 axis maps [deg].
 MISALIGNED = 3.0
 
@@ -54,7 +54,7 @@ class LensRun:
     model: str
     seed: int
     exit_code: int
-    seconds: float   # of the images that were used
+    seconds: float  # of the images that were used
     truth: Poses
     calibrated: Poses = Poses()
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -70,19 +70,27 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
     rng = np.random.default_rng([2, seed])
     width = SimulationConfig().width
     config = SimulationConfig(
-        seed=seed, scene=SCENES[seed % len(SCENES)], fx=0.8 * width * rng.uniform(*FOCAL),
+        seed=seed,
+        scene=SCENES[seed % len(SCENES)],
+        fx=0.8 * width * rng.uniform(*FOCAL),
         readout_time=round(rng.uniform(0.012, 0.032), 4),
-        time_offset=round(rng.uniform(-0.08, 0.08), 4))
+        time_offset=round(rng.uniform(-0.08, 0.08), 4),
+    )
     camera, shift = config.camera, rng.uniform(-CENTER, CENTER, 2)
     others = (0.0,) * (3 if model == 'equidistant' else 4)
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     camera = replace(
-        camera, cx=0.5 * (camera.width - 1) + shift[0], cy=0.5 * (camera.height - 1) + shift[1],
-        distortion_model=model, distortion=(float(rng.uniform(*MODELS[model])), *others))
+        camera,
+        cx=0.5 * (camera.width - 1) + shift[0],
+        cy=0.5 * (camera.height - 1) + shift[1],
+        distortion_model=model,
+        distortion=(float(rng.uniform(*MODELS[model])), *others),
+    )
     while np.isnan(camera.unproject(corners)).any():
-        camera = replace(camera, distortion=(0.9 * camera.distortion[0], *others))   # no such lens
-    axes = (Rotation.from_rotvec(rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True)
-            * Rotation.from_matrix(axis_maps()[rng.integers(24)]))
+        camera = replace(camera, distortion=(0.9 * camera.distortion[0], *others))  # no such lens
+    axes = Rotation.from_rotvec(
+        rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True
+    ) * Rotation.from_matrix(axis_maps()[rng.integers(24)])
     return replace(config, quat_cam_imu_xyzw=tuple(axes.as_quat().tolist())), camera
 
 
@@ -91,8 +99,9 @@ def calibrated_live(bag: Path, parameters: Path) -> float:
 
     The bag waits for each fit: not a measurement of its time. NaN: not calibrated.
     """
-    calibration = LiveCalibration(Parameters.from_mapping({'image_transport': 'compressed'}),
-                                  use_stored=False)
+    calibration = LiveCalibration(
+        Parameters.from_mapping({'image_transport': 'compressed'}), use_stored=False
+    )
     with closing(calibration), open_bag(bag) as opened:
         first_ns = 0
         for role, message in sensor_messages(opened, opened.find_topics(needs_camera_info=False)):
@@ -108,8 +117,9 @@ def calibrated_live(bag: Path, parameters: Path) -> float:
     return math.nan
 
 
-def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool,
-            known: bool) -> LensRun:
+def on_lens(
+    seed: int, model: str, seconds: float, folder: Path, *, live: bool, known: bool
+) -> LensRun:
     """Render a bag unless it exists, calibrate, and replay with both calibrations.
 
     live: by the calibration of a running node, which ends as soon as its result suffices. known:
@@ -121,12 +131,18 @@ def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool,
     def render(bag: Path, parameters: Path) -> None:
         simulation = simulate(config, camera=camera)
         write_bag(simulation, bag, camera_info=known)
-        values = {**right_parameters(simulation), 'image_transport': 'compressed',
-                  'camera_matrix': tuple(camera.camera_matrix.ravel().tolist()),
-                  'distortion_model': camera.distortion_model,
-                  'distortion_coefficients': camera.distortion}
-        write_parameters(parameters, 'The truth.',
-                         [SourcedValue(name, value, '') for name, value in values.items()])
+        values = {
+            **right_parameters(simulation),
+            'image_transport': 'compressed',
+            'camera_matrix': tuple(camera.camera_matrix.ravel().tolist()),
+            'distortion_model': camera.distortion_model,
+            'distortion_coefficients': camera.distortion,
+        }
+        write_parameters(
+            parameters,
+            'The truth.',
+            [SourcedValue(name, value, '') for name, value in values.items()],
+        )
 
     bag, truth = made_once(folder, 'bag', render)
     parameters = folder / 'calibration' / 'calibration.yaml'
@@ -135,14 +151,24 @@ def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool,
         seconds = calibrated_live(bag, parameters)
         code = int(math.isnan(seconds))
     else:
-        code = rs_relpose(['calibrate', str(bag), '--out', str(parameters.parent),
-                           *([] if known else ['--lens', model])])
+        code = rs_relpose(
+            [
+                'calibrate',
+                str(bag),
+                '--out',
+                str(parameters.parent),
+                *([] if known else ['--lens', model]),
+            ]
+        )
     run = LensRun(model, seed, code, seconds, _poses(bag, truth))
     if code:
         return run
     found = read_parameters(parameters)
-    return replace(run, calibrated=_poses(bag, parameters),
-                   errors=_errors(found, config) | ({} if known else _of_lens(found, camera)))
+    return replace(
+        run,
+        calibrated=_poses(bag, parameters),
+        errors=_errors(found, config) | ({} if known else _of_lens(found, camera)),
+    )
 
 
 def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float, float]]:
@@ -154,52 +180,101 @@ def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float
         'readout [s]': (sensor.readout_time - truth.readout_time, sensor.readout_time_sigma),
         'offset [s]': (sensor.time_offset - truth.time_offset, sensor.time_offset_sigma),
         **{f'axes {axis} [rad]': (turn[k], sensor.axes_sigma) for k, axis in enumerate('xyz')},
-        **{f'bias {axis} [rad/s]': (bias[k], imu.gyro_bias_sigma) for k, axis in enumerate('xyz')}}
+        **{f'bias {axis} [rad/s]': (bias[k], imu.gyro_bias_sigma) for k, axis in enumerate('xyz')},
+    }
 
 
 def _of_lens(found: Parameters, truth: RollingShutterCamera) -> dict[str, tuple[float, float]]:
     sigmas, lens = found.intrinsics, found.intrinsics.of_image(truth.width, truth.height)
     center = max(abs(lens.cx - truth.cx), abs(lens.cy - truth.cy))
-    return dict(zip(LENS, (
-        (100.0 * (lens.fx / truth.fx - 1.0), 100.0 * sigmas.focal_length_sigma),
-        (lens.distortion[0] - truth.distortion[0], sigmas.distortion_sigma),
-        (center, sigmas.principal_point_sigma)), strict=True))
+    return dict(
+        zip(
+            LENS,
+            (
+                (100.0 * (lens.fx / truth.fx - 1.0), 100.0 * sigmas.focal_length_sigma),
+                (lens.distortion[0] - truth.distortion[0], sigmas.distortion_sigma),
+                (center, sigmas.principal_point_sigma),
+            ),
+            strict=True,
+        )
+    )
 
 
 def _poses(bag: Path, parameters: Path) -> Poses:
-    pairs = list(consistency.replayed(bag, read_parameters(parameters), SIMULATED,
-                                      bag.parent.name))
-    squares = np.array([(T_FREEDOM * pair.translation_nees, R_FREEDOM * pair.rotation_nees)
-                        for pair in pairs if not math.isnan(pair.rotation)]).reshape(-1, 2)
+    pairs = list(
+        consistency.replayed(bag, read_parameters(parameters), SIMULATED, bag.parent.name)
+    )
+    squares = np.array(
+        [
+            (T_FREEDOM * pair.translation_nees, R_FREEDOM * pair.rotation_nees)
+            for pair in pairs
+            if not math.isnan(pair.rotation)
+        ]
+    ).reshape(-1, 2)
     beyond = squares > chi2([T_FREEDOM, R_FREEDOM]).ppf(QUANTILE)
-    return Poses(len(pairs), len(squares),
-                 float(np.nanmedian([pair.translation for pair in pairs])),
-                 float(np.nanmedian([pair.rotation for pair in pairs])),
-                 *beyond.sum(axis=0) / max(len(squares), 1))
+    return Poses(
+        len(pairs),
+        len(squares),
+        float(np.nanmedian([pair.translation for pair in pairs])),
+        float(np.nanmedian([pair.rotation for pair in pairs])),
+        *beyond.sum(axis=0) / max(len(squares), 1),
+    )
 
 
 def write_report(folder: Path, runs: Sequence[LensRun]) -> str:
     """Write the runs (CSV) and the table (Markdown), and return the latter."""
-    rows = [[f'{run.model} {run.seed}', str(run.exit_code), f'{run.seconds:.1f}',
-             *('{:.3f} +- {:.3f}'.format(*run.errors[name]) if name in run.errors else ''
-               for name in LENS), *_cells([run])] for run in runs]
+    rows = [
+        [
+            f'{run.model} {run.seed}',
+            str(run.exit_code),
+            f'{run.seconds:.1f}',
+            *(
+                '{:.3f} +- {:.3f}'.format(*run.errors[name]) if name in run.errors else ''
+                for name in LENS
+            ),
+            *_cells([run]),
+        ]
+        for run in runs
+    ]
     rows.append(['all', *5 * [''], *_cells(runs)])
-    return write_table(folder, 'lenses', runs, markdown_table(
-        ['bag', 'exit code', 'images [s]', *(f'{name}: error' for name in LENS),
-         'values within 3 sigma (largest)', 'median error over that with the truth: t / R',
-         'poses of pairs', 'beyond 99.7 %: t / R', 'with the truth', 'beyond'], rows))
+    return write_table(
+        folder,
+        'lenses',
+        runs,
+        markdown_table(
+            [
+                'bag',
+                'exit code',
+                'images [s]',
+                *(f'{name}: error' for name in LENS),
+                'values within 3 sigma (largest)',
+                'median error over that with the truth: t / R',
+                'poses of pairs',
+                'beyond 99.7 %: t / R',
+                'with the truth',
+                'beyond',
+            ],
+            rows,
+        ),
+    )
 
 
 def _cells(runs: Sequence[LensRun]) -> list[str]:
     """Of one or several bags; of several: medians of the ratios, sums of the rest."""
     sizes = np.array([size for run in runs for size in run.in_sigmas])
-    ratios = [np.nanmedian([getattr(run.calibrated, name) / getattr(run.truth, name)
-                            for run in runs]) for name in ('median_t', 'median_r')]
-    cells = [f'{np.count_nonzero(sizes <= 3.0)} of {len(sizes)} ({sizes.max(initial=0.0):.1f})',
-             ' / '.join(f'{ratio:.2f}' for ratio in ratios)]
+    ratios = [
+        np.nanmedian([getattr(run.calibrated, name) / getattr(run.truth, name) for run in runs])
+        for name in ('median_t', 'median_r')
+    ]
+    cells = [
+        f'{np.count_nonzero(sizes <= 3.0)} of {len(sizes)} ({sizes.max(initial=0.0):.1f})',
+        ' / '.join(f'{ratio:.2f}' for ratio in ratios),
+    ]
     for found in ([run.calibrated for run in runs], [run.truth for run in runs]):
         pairs, count = sum(poses.pairs for poses in found), sum(poses.count for poses in found)
-        t, R = (sum(getattr(poses, name) * poses.count for poses in found) / max(count, 1)
-                for name in ('beyond_t', 'beyond_r'))
+        t, R = (
+            sum(getattr(poses, name) * poses.count for poses in found) / max(count, 1)
+            for name in ('beyond_t', 'beyond_r')
+        )
         cells += [f'{count} of {pairs}', f'{t:.1%} / {R:.1%}']
     return cells

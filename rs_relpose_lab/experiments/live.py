@@ -27,7 +27,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.pipeline.sequencer import Refusal
 
-if TYPE_CHECKING:   # the rest of this module needs no ROS
+if TYPE_CHECKING:  # the rest of this module needs no ROS
     from rs_relpose_lab.live.live_run import MeasuredRun, ReceivedPose
 
 
@@ -57,9 +57,15 @@ class LiveCell:
         return self.width * self.height * bytes_per_pixel > 512 * 1024
 
 
-CELLS = {cell.name: cell for cell in (
-    LiveCell(width, height, image_format, imu_rate)
-    for width, height in SIZES for image_format in FORMATS for imu_rate in live_clip.IMU_RATES)}
+CELLS = {
+    cell.name: cell
+    for cell in (
+        LiveCell(width, height, image_format, imu_rate)
+        for width, height in SIZES
+        for image_format in FORMATS
+        for imu_rate in live_clip.IMU_RATES
+    )
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +91,9 @@ class LiveStatistics:
     cell: str
     duration: float
     frames_sent: int
-    frames_received: int   # by the node's callback
-    frames_used: int   # through the whole pipeline
-    dropped_overload: int   # refused by the node because newer frames waited
+    frames_received: int  # by the node's callback
+    frames_used: int  # through the whole pipeline
+    dropped_overload: int  # refused by the node because newer frames waited
     dropped_other: int
     imu_sent: int
     imu_received: int
@@ -95,51 +101,71 @@ class LiveStatistics:
     poses: int
     # From the callbacks of image and first IMU sample that covers its last row to publication.
     latency: Percentiles
-    end_to_end: Percentiles   # the same by the player and a third process that receives the pose
-    frame_time: Percentiles   # wall time of every frame, pair or not
-    frame_cpu: Percentiles   # processor time of the worker
-    cpu: float   # of the node, percent of one core
-    cpu_callbacks: float   # of its first thread
+    end_to_end: Percentiles  # the same by the player and a third process that receives the pose
+    frame_time: Percentiles  # wall time of every frame, pair or not
+    frame_cpu: Percentiles  # processor time of the worker
+    cpu: float  # of the node, percent of one core
+    cpu_callbacks: float  # of its first thread
     cpu_player: float
-    memory_start: float   # resident, after the first pose
+    memory_start: float  # resident, after the first pose
     memory_end: float
-    private_start: float   # without what is shared with other processes
+    private_start: float  # without what is shared with other processes
     private_end: float
-    seconds_to_ready: float   # from the start of the node's process to its subscriptions
-    seconds_to_pose: float   # from the first frame to the first pose
+    seconds_to_ready: float  # from the start of the node's process to its subscriptions
+    seconds_to_pose: float  # from the first frame to the first pose
     rotation_error: Percentiles
     translation_error: Percentiles
-    wrong: int   # poses that are off by more than 1 deg, or 15 deg in the direction of translation
-    player_late: Percentiles   # how late the player published
+    wrong: int  # poses that are off by more than 1 deg, or 15 deg in the direction of translation
+    player_late: Percentiles  # how late the player published
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
     """Latency and memory over time."""
 
-    latency_seconds: Array   # (N,) since the first pair
-    latencies: Array   # (N,) [ms]
-    memory_seconds: Array   # (M,) since the first pair
-    private: Array   # (M,) [MB] that are not shared
+    latency_seconds: Array  # (N,) since the first pair
+    latencies: Array  # (N,) [ms]
+    memory_seconds: Array  # (M,) since the first pair
+    private: Array  # (M,) [MB] that are not shared
 
 
-def run_cell(cell: LiveCell, clip: tuple[Path, Path], duration: float, folder: Path, profile: Path,
-             on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
+def run_cell(
+    cell: LiveCell,
+    clip: tuple[Path, Path],
+    duration: float,
+    folder: Path,
+    profile: Path,
+    on_second: Callable[[], object] = lambda: None,
+) -> tuple[LiveStatistics, Course]:
     """Play a clip of the cell's size to a new node; logs and tables into `folder`.
 
     `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
     from rs_relpose_lab.live.live_run import measure
+
     folder.mkdir(parents=True, exist_ok=True)
     compressed = cell.image_format == 'jpeg'
     topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, live_clip.imu_topic(cell.imu_rate))
-    player = ['--best-effort', '--loop', str(live_clip.PERIOD), '--duration', str(duration),
-              '--topics', *topics, *([] if compressed else ['--decode', cell.image_format])]
+    player = [
+        '--best-effort',
+        '--loop',
+        str(live_clip.PERIOD),
+        '--duration',
+        str(duration),
+        '--topics',
+        *topics,
+        *([] if compressed else ['--decode', cell.image_format]),
+    ]
     run = measure(
-        *clip, {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
-        'compressed' if compressed else 'raw', player, profile if cell.is_big else None, folder,
-        on_second)
+        *clip,
+        {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
+        'compressed' if compressed else 'raw',
+        player,
+        profile if cell.is_big else None,
+        folder,
+        on_second,
+    )
     # Processor time and memory of the node, a line per second.
     write_csv(folder / 'node.csv', run.metrics)
     return statistics_of(cell, duration, run), course_of(run)
@@ -156,24 +182,35 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
     rotation, translation = errors(run.poses)
     first, end = run.metrics[0], run.metrics[-1]
     return LiveStatistics(
-        cell=cell.name, duration=duration, frames_sent=len(images),
-        frames_received=int(run.counters['frames_received']), frames_used=len(frames),
-        dropped_overload=refused.pop(Refusal.OVERLOAD), dropped_other=sum(refused.values()),
-        imu_sent=len(imu), imu_received=int(run.counters['imu_samples']),
-        pairs=int(np.count_nonzero(paired)), poses=len(run.poses),
+        cell=cell.name,
+        duration=duration,
+        frames_sent=len(images),
+        frames_received=int(run.counters['frames_received']),
+        frames_used=len(frames),
+        dropped_overload=refused.pop(Refusal.OVERLOAD),
+        dropped_other=sum(refused.values()),
+        imu_sent=len(imu),
+        imu_received=int(run.counters['imu_samples']),
+        pairs=int(np.count_nonzero(paired)),
+        poses=len(run.poses),
         latency=Percentiles.of(latency[posed]),
         end_to_end=Percentiles.of(_end_to_end(run.poses, images, imu)),
         frame_time=Percentiles.of((frames['done_ns'] - frames['taken_ns']) / 1e6),
         frame_cpu=Percentiles.of(frames['cpu_ns'] / 1e6),
-        cpu=_percent(first, end, 'cpu'), cpu_callbacks=_percent(first, end, 'cpu_main'),
+        cpu=_percent(first, end, 'cpu'),
+        cpu_callbacks=_percent(first, end, 'cpu_main'),
         cpu_player=_percent(run.player_metrics[0], run.player_metrics[-1], 'cpu'),
-        memory_start=first.resident, memory_end=end.resident, private_start=first.private,
+        memory_start=first.resident,
+        memory_end=end.resident,
+        private_start=first.private,
         private_end=end.private,
         seconds_to_ready=(run.ready_ns - run.started_ns) / NANOSECONDS,
         seconds_to_pose=(run.poses[0].received_ns - images['published_ns'][0]) / NANOSECONDS,
-        rotation_error=Percentiles.of(rotation), translation_error=Percentiles.of(translation),
+        rotation_error=Percentiles.of(rotation),
+        translation_error=Percentiles.of(translation),
         wrong=int(np.count_nonzero((rotation > 1.0) | (translation > 15.0))),
-        player_late=Percentiles.of((log['published_ns'] - log['due_ns']) / 1e6))
+        player_late=Percentiles.of((log['published_ns'] - log['due_ns']) / 1e6),
+    )
 
 
 def course_of(run: MeasuredRun) -> Course:
@@ -185,7 +222,8 @@ def course_of(run: MeasuredRun) -> Course:
         (posed['ready_ns'] - start_ns) / NANOSECONDS,
         (posed['done_ns'] - posed['ready_ns']) / 1e6,
         np.array([(f.time_ns - start_ns) / NANOSECONDS for f in run.metrics]),
-        np.array([f.private for f in run.metrics]))
+        np.array([f.private for f in run.metrics]),
+    )
 
 
 def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
@@ -193,29 +231,48 @@ def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
     motion = live_clip.closed_loop(live_clip.PERIOD)
     found = []
     for pose in poses:
-        (p1, p2), (R1, R2) = motion.poses([live_clip.seconds_into_loop(stamp) for stamp in (
-            pose.reference_stamp_ns, pose.stamp_ns)])
-        found.append(pose_error(Rotation.from_quat(pose.quat_xyzw).as_matrix(), np.array(pose.t),
-                                R1.T @ R2, R1.T @ (p2 - p1)))
-    return (np.array([error.rotation for error in found]),
-            np.array([error.translation for error in found]))
+        (p1, p2), (R1, R2) = motion.poses(
+            [
+                live_clip.seconds_into_loop(stamp)
+                for stamp in (pose.reference_stamp_ns, pose.stamp_ns)
+            ]
+        )
+        found.append(
+            pose_error(
+                Rotation.from_quat(pose.quat_xyzw).as_matrix(),
+                np.array(pose.t),
+                R1.T @ R2,
+                R1.T @ (p2 - p1),
+            )
+        )
+    return (
+        np.array([error.rotation for error in found]),
+        np.array([error.translation for error in found]),
+    )
 
 
-def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],
-                imu: NDArray[np.void]) -> Array:
+def _end_to_end(
+    poses: Sequence[ReceivedPose], images: NDArray[np.void], imu: NDArray[np.void]
+) -> Array:
     # A row earlier does not matter: samples are further apart.
     readout_ns = to_nanoseconds(live_clip.configuration(*SIZES[0]).readout_time)
-    image_sent = dict(zip(images['stamp_ns'].tolist(), images['published_ns'].tolist(),
-                          strict=True))
+    image_sent = dict(
+        zip(images['stamp_ns'].tolist(), images['published_ns'].tolist(), strict=True)
+    )
     covering = np.searchsorted(imu['stamp_ns'], [p.stamp_ns + readout_ns for p in poses])
-    return np.array([
-        (pose.received_ns - max(image_sent[pose.stamp_ns], int(imu['published_ns'][k]))) / 1e6
-        for pose, k in zip(poses, covering, strict=True) if k < len(imu)])
+    return np.array(
+        [
+            (pose.received_ns - max(image_sent[pose.stamp_ns], int(imu['published_ns'][k]))) / 1e6
+            for pose, k in zip(poses, covering, strict=True)
+            if k < len(imu)
+        ]
+    )
 
 
 def _read_frames(path: Path) -> NDArray[np.void]:
-    return np.atleast_1d(np.genfromtxt(path, delimiter=',', names=True, dtype=None,
-                                       encoding='ascii'))
+    return np.atleast_1d(
+        np.genfromtxt(path, delimiter=',', names=True, dtype=None, encoding='ascii')
+    )
 
 
 def _percent(first: ProcessMetrics, last: ProcessMetrics, name: str) -> float:
@@ -227,38 +284,108 @@ def _percent(first: ProcessMetrics, last: ProcessMetrics, name: str) -> float:
 
 # -- tables of the live benchmark -----------------------------------------------------------------
 
+
 def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
     """Write table, plot and report into a folder; the report."""
-    report = '\n'.join([
-        '# The live node\n',
-        (f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
-         f'{platform.python_version()}; images at 30 Hz from best-effort publishers. Times in ms: '
-         'median / 99th percentile. CPU in percent of one core.\n'),
-        markdown_table(
-            ('cell', 'sent', 'lost before the node', 'used', 'dropped (overload)',
-             'dropped (other)', 'IMU lost', 'poses', 'wrong'),
-            [(c.cell, f'{c.frames_sent}', f'{c.frames_sent - c.frames_received}',
-              f'{c.frames_used}', f'{c.dropped_overload}', f'{c.dropped_other}',
-              f'{c.imu_sent - c.imu_received}', f'{c.poses} of {c.pairs}', f'{c.wrong}')
-             for c in cells]),
-        markdown_table(
-            ('cell', 'latency', 'end to end', 'time of a frame', 'CPU time of a frame',
-             'CPU of the node', 'of its callbacks', 'of the player', 'memory [MB]'),
-            [(c.cell, _two(c.latency), _two(c.end_to_end), _two(c.frame_time), _two(c.frame_cpu),
-              f'{c.cpu:.0f}', f'{c.cpu_callbacks:.0f}', f'{c.cpu_player:.0f}',
-              f'{c.memory_start:.0f} -> {c.memory_end:.0f}') for c in cells]),
-        markdown_table(
-            ('cell', 'process to ready [s]', 'first frame to first pose [s]', 'R [deg]',
-             't [deg]', 'player late [ms]'),
-            [(c.cell, f'{c.seconds_to_ready:.2f}', f'{c.seconds_to_pose:.2f}',
-              _two(c.rotation_error, 3), _two(c.translation_error, 2), _two(c.player_late, 2))
-             for c in cells]),
-        ('Latency is that of published pairs: from the later of image and first IMU sample that '
-         'covers its last row, at the callbacks of the node, to publication. End to end is the '
-         'same from outside: from the publication of the later of the two by the player to the '
-         'receipt of the pose by a third process. A frame without keyframe pair publishes nothing '
-         'and counts in the time of a frame, which is that of all frames, from its start to its '
-         'end.\n')])
+    report = '\n'.join(
+        [
+            '# The live node\n',
+            (
+                f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
+                f'{platform.python_version()}; images at 30 Hz from best-effort publishers. '
+                f'Times in ms: '
+                'median / 99th percentile. CPU in percent of one core.\n'
+            ),
+            markdown_table(
+                (
+                    'cell',
+                    'sent',
+                    'lost before the node',
+                    'used',
+                    'dropped (overload)',
+                    'dropped (other)',
+                    'IMU lost',
+                    'poses',
+                    'wrong',
+                ),
+                [
+                    (
+                        c.cell,
+                        f'{c.frames_sent}',
+                        f'{c.frames_sent - c.frames_received}',
+                        f'{c.frames_used}',
+                        f'{c.dropped_overload}',
+                        f'{c.dropped_other}',
+                        f'{c.imu_sent - c.imu_received}',
+                        f'{c.poses} of {c.pairs}',
+                        f'{c.wrong}',
+                    )
+                    for c in cells
+                ],
+            ),
+            markdown_table(
+                (
+                    'cell',
+                    'latency',
+                    'end to end',
+                    'time of a frame',
+                    'CPU time of a frame',
+                    'CPU of the node',
+                    'of its callbacks',
+                    'of the player',
+                    'memory [MB]',
+                ),
+                [
+                    (
+                        c.cell,
+                        _two(c.latency),
+                        _two(c.end_to_end),
+                        _two(c.frame_time),
+                        _two(c.frame_cpu),
+                        f'{c.cpu:.0f}',
+                        f'{c.cpu_callbacks:.0f}',
+                        f'{c.cpu_player:.0f}',
+                        f'{c.memory_start:.0f} -> {c.memory_end:.0f}',
+                    )
+                    for c in cells
+                ],
+            ),
+            markdown_table(
+                (
+                    'cell',
+                    'process to ready [s]',
+                    'first frame to first pose [s]',
+                    'R [deg]',
+                    't [deg]',
+                    'player late [ms]',
+                ),
+                [
+                    (
+                        c.cell,
+                        f'{c.seconds_to_ready:.2f}',
+                        f'{c.seconds_to_pose:.2f}',
+                        _two(c.rotation_error, 3),
+                        _two(c.translation_error, 2),
+                        _two(c.player_late, 2),
+                    )
+                    for c in cells
+                ],
+            ),
+            (
+                'Latency is that of published pairs: from the later of image and first IMU '
+                'sample that '
+                'covers its last row, at the callbacks of the node, to publication. End to end '
+                'is the '
+                'same from outside: from the publication of the later of the two by the player '
+                'to the '
+                'receipt of the pose by a third process. A frame without keyframe pair publishes '
+                'nothing '
+                'and counts in the time of a frame, which is that of all frames, from its start '
+                'to its '
+                'end.\n'
+            ),
+        ]
+    )
     write_table(folder, 'live', cells, report)
     return report
 
@@ -266,18 +393,30 @@ def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
 def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str:
     """Write memory and latency over time; the summary (Markdown)."""
     windows = latency_over_time(course)
-    report = '\n'.join([
-        f'## {cell.cell}: {cell.duration / 60.0:.0f} minutes\n',
-        (f'{cell.frames_sent} frames sent, {cell.frames_used} used, {cell.dropped_overload} '
-         f'dropped for overload, {cell.dropped_other} for other reasons; '
-         f'{cell.imu_sent - cell.imu_received} of {cell.imu_sent} IMU samples lost; {cell.poses} '
-         f'poses, {cell.wrong} of them wrong; the node took {cell.cpu:.0f} % of a core. Private '
-         f'memory {cell.private_start:.1f} MB after the first pose, {cell.private_end:.1f} MB at '
-         f'the end, {memory_drift(course):+.1f} MB/h after the first tenth.\n'),
-        markdown_table(
-            ('from [min]', 'latency p50 [ms]', 'p99 [ms]'),
-            [(f'{start / 60.0:.1f}', f'{latency.p50:.1f}', f'{latency.p99:.1f}')
-             for start, latency in windows])])
+    report = '\n'.join(
+        [
+            f'## {cell.cell}: {cell.duration / 60.0:.0f} minutes\n',
+            (
+                f'{cell.frames_sent} frames sent, {cell.frames_used} used, '
+                f'{cell.dropped_overload} '
+                f'dropped for overload, {cell.dropped_other} for other reasons; '
+                f'{cell.imu_sent - cell.imu_received} of {cell.imu_sent} IMU samples lost; '
+                f'{cell.poses} '
+                f'poses, {cell.wrong} of them wrong; the node took {cell.cpu:.0f} % of a core. '
+                f'Private '
+                f'memory {cell.private_start:.1f} MB after the first pose, '
+                f'{cell.private_end:.1f} MB at '
+                f'the end, {memory_drift(course):+.1f} MB/h after the first tenth.\n'
+            ),
+            markdown_table(
+                ('from [min]', 'latency p50 [ms]', 'p99 [ms]'),
+                [
+                    (f'{start / 60.0:.1f}', f'{latency.p50:.1f}', f'{latency.p99:.1f}')
+                    for start, latency in windows
+                ],
+            ),
+        ]
+    )
     write_table(folder, 'live', [cell], report)
     return report
 
@@ -287,9 +426,17 @@ def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
     end = float(course.latency_seconds[-1])
     length = 60.0 if end >= 300.0 else max(end / 10.0, 1e-3)
     starts = np.arange(0.0, end, length)
-    return [(float(start), Percentiles.of(course.latencies[
-        (course.latency_seconds >= start) & (course.latency_seconds < start + length)]))
-        for start in starts]
+    return [
+        (
+            float(start),
+            Percentiles.of(
+                course.latencies[
+                    (course.latency_seconds >= start) & (course.latency_seconds < start + length)
+                ]
+            ),
+        )
+        for start in starts
+    ]
 
 
 def memory_drift(course: Course) -> float:
@@ -306,12 +453,26 @@ def memory_drift(course: Course) -> float:
 
 TURNS = 3
 # Columns of live.csv, the same in all releases.
-COMPARED = ('latency_p50', 'latency_p99', 'end_to_end_p50', 'end_to_end_p99', 'cpu',
-            'memory_end', 'rotation_error_p50', 'translation_error_p50')
+COMPARED = (
+    'latency_p50',
+    'latency_p99',
+    'end_to_end_p50',
+    'end_to_end_p99',
+    'cpu',
+    'memory_end',
+    'rotation_error_p50',
+    'translation_error_p50',
+)
 
 
-def compare_checkouts(this: Path, other: Path, cells: Sequence[str], duration: float, folder: Path,
-                      on_run: Callable[[], object] = lambda: None) -> str:
+def compare_checkouts(
+    this: Path,
+    other: Path,
+    cells: Sequence[str],
+    duration: float,
+    folder: Path,
+    on_run: Callable[[], object] = lambda: None,
+) -> str:
     """Run the live benchmark of two checkouts by turns; the report of the ratios this / other.
 
     Each checkout runs its own command, with this interpreter, and has its tables in a folder of
@@ -324,30 +485,69 @@ def compare_checkouts(this: Path, other: Path, cells: Sequence[str], duration: f
             for name, checkout in (('this', this), ('other', other)):
                 measured.append(_measured_by(checkout, cell, duration, folder / name))
                 on_run()
-            ratios.append({'cell': cell, 'turn': turn, **{
-                column: a / b for column, a, b in zip(COMPARED, *measured, strict=True)}})
+            ratios.append(
+                {
+                    'cell': cell,
+                    'turn': turn,
+                    **{column: a / b for column, a, b in zip(COMPARED, *measured, strict=True)},
+                }
+            )
     rows = []
     for cell in cells:
-        of_cell = [[turn[column] for column in COMPARED] for turn in ratios
-                   if turn['cell'] == cell]
-        rows.append((cell, *(f'{median:.2f} ({low:.2f} to {high:.2f})' for low, median, high in
-                             np.percentile(of_cell, (0.0, 50.0, 100.0), axis=0).T)))
-    return write_table(folder, 'against', ratios, '\n'.join([
-        f'# This checkout / {other}\n', f'Median ratio of {TURNS} turns, least and largest.\n',
-        markdown_table(('cell', *COMPARED), rows)]))
+        of_cell = [
+            [turn[column] for column in COMPARED] for turn in ratios if turn['cell'] == cell
+        ]
+        rows.append(
+            (
+                cell,
+                *(
+                    f'{median:.2f} ({low:.2f} to {high:.2f})'
+                    for low, median, high in np.percentile(of_cell, (0.0, 50.0, 100.0), axis=0).T
+                ),
+            )
+        )
+    return write_table(
+        folder,
+        'against',
+        ratios,
+        '\n'.join(
+            [
+                f'# This checkout / {other}\n',
+                f'Median ratio of {TURNS} turns, least and largest.\n',
+                markdown_table(('cell', *COMPARED), rows),
+            ]
+        ),
+    )
 
 
 def _measured_by(checkout: Path, cell: str, duration: float, folder: Path) -> list[float]:
     """The `COMPARED` columns of a cell."""
     done = subprocess.run(
-        [sys.executable, '-m', 'rs_relpose_ros.cli.main', 'benchmark', 'live', '--cells', cell,
-         '--output', str(folder.resolve()), '--duration', str(duration)],
-        cwd=checkout, check=False, text=True,
-        env={**os.environ, 'PYTHONPATH': str(checkout.resolve())}, stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL)
+        [
+            sys.executable,
+            '-m',
+            'rs_relpose_ros.cli.main',
+            'benchmark',
+            'live',
+            '--cells',
+            cell,
+            '--output',
+            str(folder.resolve()),
+            '--duration',
+            str(duration),
+        ],
+        cwd=checkout,
+        check=False,
+        text=True,
+        env={**os.environ, 'PYTHONPATH': str(checkout.resolve())},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+    )
     if done.returncode:
-        raise InputError(f'{checkout}: benchmark live ended with code {done.returncode}: '
-                         + done.stderr.strip().rpartition('\n')[2])
+        raise InputError(
+            f'{checkout}: benchmark live ended with code {done.returncode}: '
+            + done.stderr.strip().rpartition('\n')[2]
+        )
     with (folder / 'live.csv').open(newline='', encoding='utf-8') as file:
         row = next(csv.DictReader(file))
     return [float(row[column] or 'nan') for column in COMPARED]

@@ -17,7 +17,7 @@ from rs_relpose_ros.bags import reader
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.offline.replay import read_truth
 
-if TYPE_CHECKING:   # the report needs no ROS
+if TYPE_CHECKING:  # the report needs no ROS
     from rs_relpose_lab.live.live_cases import Case
 
 
@@ -30,7 +30,7 @@ class CaseRun:
     named: float
     poses: int
     beyond: int
-    last: str   # the node's last message
+    last: str  # the node's last message
 
     @property
     def good(self) -> bool:
@@ -53,21 +53,45 @@ def run_case(case: 'Case', folder: Path) -> CaseRun:
     known = {stamp_ns(item.header): item for item in poses}
     beyond, limits = 0, chi2([2, 3]).ppf(QUANTILE)
     for stamp in by_stamp.keys() & known.keys():
-        pair = truth.relative_pose(*(at - case.jump_ns * (not truth.covers(at))
-                                     for at in (by_stamp[stamp], stamp)))
+        pair = truth.relative_pose(
+            *(at - case.jump_ns * (not truth.covers(at)) for at in (by_stamp[stamp], stamp))
+        )
         t, quat = pose_of(known[stamp])
         if pair is not None and np.linalg.norm(pair[1]) > STILL:
-            beyond += bool((np.array(chi_squares(
-                Rotation.from_quat(quat).as_matrix(), np.array(t), *pair,
-                np.reshape(known[stamp].pose.covariance, (6, 6)))) > limits).any())
+            beyond += bool(
+                (
+                    np.array(
+                        chi_squares(
+                            Rotation.from_quat(quat).as_matrix(),
+                            np.array(t),
+                            *pair,
+                            np.reshape(known[stamp].pose.covariance, (6, 6)),
+                        )
+                    )
+                    > limits
+                ).any()
+            )
     return CaseRun(case.name, case.words, named, len(known), beyond, last)
 
 
 def write_report(folder: Path, runs: Sequence[CaseRun]) -> str:
     """Write the runs (CSV) and the table (Markdown), and return the latter."""
-    rows = [[run.name, 'yes' if run.good else 'NO',
-             f'{run.named:.1f}' if run.words else 'harmless', f'{run.poses} ({run.beyond})',
-             run.last[:90]] for run in runs]
+    rows = [
+        [
+            run.name,
+            'yes' if run.good else 'NO',
+            f'{run.named:.1f}' if run.words else 'harmless',
+            f'{run.poses} ({run.beyond})',
+            run.last[:90],
+        ]
+        for run in runs
+    ]
     rows.append([f'{sum(run.good for run in runs)} of {len(runs)}', *4 * ['']])
-    return write_table(folder, 'live_cases', runs, markdown_table(
-        ['case', 'good', 'named after [s]', 'poses (beyond 99.7 %)', 'last message'], rows))
+    return write_table(
+        folder,
+        'live_cases',
+        runs,
+        markdown_table(
+            ['case', 'good', 'named after [s]', 'poses (beyond 99.7 %)', 'last message'], rows
+        ),
+    )

@@ -40,26 +40,42 @@ def imu_topic(rate: int) -> str:
 def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> SimulationConfig:
     """Recording of a clip: 4 s of a hand-held-like walk in a hall, read out in 30 ms."""
     # Field of view of 71 deg across, for any size.
-    return SimulationConfig(duration=PERIOD, fps=FPS, width=width, height=height, fx=0.7 * width,
-                            imu_rate=float(imu_rate))
+    return SimulationConfig(
+        duration=PERIOD,
+        fps=FPS,
+        width=width,
+        height=height,
+        fx=0.7 * width,
+        imu_rate=float(imu_rate),
+    )
 
 
-def prepare_clip(folder: Path, width: int, height: int,
-                 on_frame: Callable[[], object] = lambda: None) -> tuple[Path, Path]:
+def prepare_clip(
+    folder: Path, width: int, height: int, on_frame: Callable[[], object] = lambda: None
+) -> tuple[Path, Path]:
     """Render a clip into a folder, unless it exists: a bag, and the parameter file of the node.
 
     Images are JPEG in colour, the IMU has all `IMU_RATES`; `on_frame` is called after each image.
     """
+
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)
         first = simulate(configuration(width, height), trajectory=trajectory)
         # The scene, which takes the time, is the same for each rate of the IMU.
-        others = [simulate(configuration(width, height, rate), trajectory=trajectory,
-                           scene=first.renderer.scene) for rate in IMU_RATES[1:]]
+        others = [
+            simulate(
+                configuration(width, height, rate),
+                trajectory=trajectory,
+                scene=first.renderer.scene,
+            )
+            for rate in IMU_RATES[1:]
+        ]
         with BagWriter(path) as bag:
-            write_in_order(bag, _images(first, bag, on_frame),
-                           *(_imu_of_one_period(simulation, bag)
-                             for simulation in (first, *others)))
+            write_in_order(
+                bag,
+                _images(first, bag, on_frame),
+                *(_imu_of_one_period(simulation, bag) for simulation in (first, *others)),
+            )
         write_parameters(first, parameters)
 
     return made_once(folder, f'{width}x{height}', render)
@@ -70,12 +86,22 @@ def coloured(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(np.rint(gray[..., None] * [0.75, 1.0, 1.15]), 0, 255).astype(np.uint8)
 
 
-def _images(simulation: Simulation, bag: BagWriter,
-            on_frame: Callable[[], object]) -> Iterator[Entry]:
+def _images(
+    simulation: Simulation, bag: BagWriter, on_frame: Callable[[], object]
+) -> Iterator[Entry]:
     def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
-        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
-                encoded_image_message(stamp_ns, CAMERA_FRAME, jpeg(coloured(pixels), quality=95),
-                                      bag.type, 'bgr8; jpeg compressed bgr8'))
+        return (
+            COMPRESSED_TOPIC,
+            'sensor_msgs/msg/CompressedImage',
+            encoded_image_message(
+                stamp_ns,
+                CAMERA_FRAME,
+                jpeg(coloured(pixels), quality=95),
+                bag.type,
+                'bgr8; jpeg compressed bgr8',
+            ),
+        )
+
     return image_entries(simulation, bag, encode, on_frame)
 
 
@@ -105,20 +131,32 @@ def closed_loop(period: float) -> Trajectory:
     steps = max(round(1.8 * period), 2)
     # Ramanujan's perimeter of an ellipse with half axes 1 and 1/2.
     half_width = 1.5 * period / 4.844
-    positions = np.stack([
-        0.5 * half_width * np.cos(phase), half_width * np.sin(phase),
-        EYE_HEIGHT + 0.03 * np.cos(steps * phase)], axis=1)
+    positions = np.stack(
+        [
+            0.5 * half_width * np.cos(phase),
+            half_width * np.sin(phase),
+            EYE_HEIGHT + 0.03 * np.cos(steps * phase),
+        ],
+        axis=1,
+    )
     angles = _waves(phase, period, ((1, 0.2), (2, 1.3), (5, 2.1)), 0.45)
-    angles = np.stack([angles, _waves(phase, period, ((1, 2.5), (3, 0.4), (6, 5.0)), 0.3),
-                       _waves(phase, period, ((2, 4.1), (4, 1.0), (7, 3.0)), 0.2)], axis=1)
+    angles = np.stack(
+        [
+            angles,
+            _waves(phase, period, ((1, 2.5), (3, 0.4), (6, 5.0)), 0.3),
+            _waves(phase, period, ((2, 4.1), (4, 1.0), (7, 3.0)), 0.2),
+        ],
+        axis=1,
+    )
     spacing = period / count
     before = math.ceil(2.0 / spacing) + DEGREE
     controls = np.arange(-before, count + before) % count
     return Trajectory(positions[controls], angles[controls], -before * spacing, spacing)
 
 
-def _waves(phase: Array, period: float, waves: tuple[tuple[int, float], ...],
-           rate: float) -> Array:
+def _waves(
+    phase: Array, period: float, waves: tuple[tuple[int, float], ...], rate: float
+) -> Array:
     """Sum of harmonics (number, phase), each with its share of a rms `rate` [rad/s]."""
     total = np.zeros_like(phase)
     for harmonic, shift in waves:

@@ -26,8 +26,14 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 
 # Camera of the problems that are drawn at random.
 CAMERA = RollingShutterCamera(
-    width=problems.WIDTH, height=problems.HEIGHT, fx=problems.FOCAL, fy=problems.FOCAL,
-    cx=problems.CENTRE_U, cy=problems.CENTRE_V, readout_time=problems.HEIGHT * problems.LINE_DELAY)
+    width=problems.WIDTH,
+    height=problems.HEIGHT,
+    fx=problems.FOCAL,
+    fy=problems.FOCAL,
+    cx=problems.CENTRE_U,
+    cy=problems.CENTRE_V,
+    readout_time=problems.HEIGHT * problems.LINE_DELAY,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +41,12 @@ class Method:
     """How a pair is estimated."""
 
     label: str
-    solver: str = ''   # of this library, as in `EstimatorConfig`
-    refinement: str = 'alternating'   # likewise
-    library: Literal['', 'opencv', 'poselib'] = ''   # another one
-    derotated: bool = False   # points are derotated by the gyro to the middle row
-    continuous_gyro: bool = False   # the gyro over the rows and between the frames is used, too
-    threshold: float = 1.0   # of another library [px]
+    solver: str = ''  # of this library, as in `EstimatorConfig`
+    refinement: str = 'alternating'  # likewise
+    library: Literal['', 'opencv', 'poselib'] = ''  # another one
+    derotated: bool = False  # points are derotated by the gyro to the middle row
+    continuous_gyro: bool = False  # the gyro over the rows and between the frames is used, too
+    threshold: float = 1.0  # of another library [px]
 
 
 # Of a pose [deg]: 0.5 rad, independent of the node's limit. For the other libraries, without
@@ -60,13 +66,23 @@ METHODS: Mapping[str, Method] = {
     'opencv': Method('OpenCV', library='opencv'),
     'opencv_derotated': Method('OpenCV derot.', library='opencv', derotated=True),
     'opencv_gyro': Method('OpenCV + gyro', library='opencv', derotated=True, continuous_gyro=True),
-} | ({
-    'poselib': Method('PoseLib', library='poselib', threshold=1.5),
-    'poselib_derotated': Method('PoseLib derot.', library='poselib', derotated=True,
-                                threshold=1.5),
-    'poselib_gyro': Method('PoseLib + gyro', library='poselib', derotated=True,
-                           continuous_gyro=True, threshold=1.5),
-} if importlib.util.find_spec('poselib') is not None else {})
+} | (
+    {
+        'poselib': Method('PoseLib', library='poselib', threshold=1.5),
+        'poselib_derotated': Method(
+            'PoseLib derot.', library='poselib', derotated=True, threshold=1.5
+        ),
+        'poselib_gyro': Method(
+            'PoseLib + gyro',
+            library='poselib',
+            derotated=True,
+            continuous_gyro=True,
+            threshold=1.5,
+        ),
+    }
+    if importlib.util.find_spec('poselib') is not None
+    else {}
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,26 +91,26 @@ class ContinuousGyro:
 
     motion1: FrameMotion
     motion2: FrameMotion
-    rotation: Array   # (3, 3) ``R_1^T R_2`` between the reference rows
-    covariance: Array   # (3, 3) of its error [rad^2]
-    interval: float   # [s] between the reference rows
-    rate_sigma: float   # [rad/s] of the motions, per axis
-    gravity_sigma: float | None = None   # [rad] likewise
+    rotation: Array  # (3, 3) ``R_1^T R_2`` between the reference rows
+    covariance: Array  # (3, 3) of its error [rad^2]
+    interval: float  # [s] between the reference rows
+    rate_sigma: float  # [rad/s] of the motions, per axis
+    gravity_sigma: float | None = None  # [rad] likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairProblem:
     """A pair of frames as every method gets it, and its truth."""
 
-    points1: Array   # (N, 2) matches [px]
+    points1: Array  # (N, 2) matches [px]
     points2: Array
     camera: RollingShutterCamera
-    motion1: FrameMotion   # one angular velocity and one direction of gravity
+    motion1: FrameMotion  # one angular velocity and one direction of gravity
     motion2: FrameMotion
-    R: Array   # true pose between the reference rows, ``X1 = R X2 + t``
-    t: Array   # of any length
-    configured: EstimatorConfig   # noise levels among them
-    quality: Array | None = None   # (N,) of the matches
+    R: Array  # true pose between the reference rows, ``X1 = R X2 + t``
+    t: Array  # of any length
+    configured: EstimatorConfig  # noise levels among them
+    quality: Array | None = None  # (N,) of the matches
     gyro: ContinuousGyro | None = None
 
     def error(self, pose: Pose | RelativePose | None) -> PoseError:
@@ -104,18 +120,26 @@ class PairProblem:
         return pose_error(pose.R, pose.t, self.R, self.t, pose.covariance)
 
 
-def as_pair(problem: problems.TwoViewProblem, cell: problems.Cell,
-            sigma_factor: float = 1.0) -> PairProblem:
+def as_pair(
+    problem: problems.TwoViewProblem, cell: problems.Cell, sigma_factor: float = 1.0
+) -> PairProblem:
     """A random problem of a cell; the configured sigmas are the true ones, times a factor."""
     # Sigmas must be positive, also where there is no noise at all.
     configured = EstimatorConfig(
         pixel_sigma=max(cell.pixel_noise * sigma_factor, 0.01),
         gravity_sigma=max(float(np.radians(cell.gravity_noise)) * sigma_factor, 1e-5),
-        gyro_sigma=max(float(np.radians(cell.gyro_noise)) * sigma_factor, 1e-6))
-    return PairProblem(problem.points1, problem.points2, CAMERA,
-                       FrameMotion(problem.measured_rate1, problem.measured_gravity1),
-                       FrameMotion(problem.measured_rate2, problem.measured_gravity2),
-                       problem.R, problem.t, configured)
+        gyro_sigma=max(float(np.radians(cell.gyro_noise)) * sigma_factor, 1e-6),
+    )
+    return PairProblem(
+        problem.points1,
+        problem.points2,
+        CAMERA,
+        FrameMotion(problem.measured_rate1, problem.measured_gravity1),
+        FrameMotion(problem.measured_rate2, problem.measured_gravity2),
+        problem.R,
+        problem.t,
+        configured,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,21 +180,29 @@ def prepared(method: Method, problem: PairProblem, seed: int) -> Estimate:
             return None
         # From the middle rows to the reference rows; how the camera moved in between is unknown.
         return replace(pose, R=middle[0] @ pose.R @ middle[1].T, t=middle[0] @ pose.t)
+
     return call
 
 
 def run_method(name: str, problem: PairProblem, seed: int) -> tuple[Status, PoseError]:
     """Estimate a pair by the method `name` of `METHODS`."""
     pose = prepared(METHODS[name], problem, seed)()
-    status = pose.status if isinstance(pose, RelativePose) else (
-        Status.OK if pose else Status.NO_CONSENSUS)
+    status = (
+        pose.status
+        if isinstance(pose, RelativePose)
+        else (Status.OK if pose else Status.NO_CONSENSUS)
+    )
     return status, problem.error(pose)
 
 
 def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimate:
     motion1, motion2, gyro = problem.motion1, problem.motion2, None
-    config = replace(problem.configured, solver=method.solver, refinement=method.refinement,
-                     max_translation_sigma=MAX_TRANSLATION_SIGMA)
+    config = replace(
+        problem.configured,
+        solver=method.solver,
+        refinement=method.refinement,
+        max_translation_sigma=MAX_TRANSLATION_SIGMA,
+    )
     if method.continuous_gyro:
         gyro = problem.gyro
         assert gyro is not None, f'{method.label} needs a pair with a continuous gyro'
@@ -179,16 +211,25 @@ def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimat
         if gyro.gravity_sigma is not None:
             config = replace(config, gravity_sigma=min(gyro.gravity_sigma, 1.5))
     return lambda: estimate_relative_pose(
-        problem.points1, problem.points2, problem.camera, motion1, motion2,
+        problem.points1,
+        problem.points2,
+        problem.camera,
+        motion1,
+        motion2,
         relative_rotation=gyro.rotation if gyro else None,
         relative_rotation_covariance=gyro.covariance if gyro else None,
         interval=gyro.interval if gyro else None,
-        config=config, rng=seed, quality=problem.quality)
+        config=config,
+        rng=seed,
+        quality=problem.quality,
+    )
 
 
-def _derotated(points: list[Array], camera: RollingShutterCamera,
-               motions: tuple[FrameMotion, FrameMotion],
-               ) -> tuple[list[Array], tuple[Array, Array]]:
+def _derotated(
+    points: list[Array],
+    camera: RollingShutterCamera,
+    motions: tuple[FrameMotion, FrameMotion],
+) -> tuple[list[Array], tuple[Array, Array]]:
     """Pixels of the points in cameras with the orientation of their middle rows.
 
     Also each camera's rotation from its reference row to its middle row. Matches with a point
@@ -196,8 +237,10 @@ def _derotated(points: list[Array], camera: RollingShutterCamera,
     """
     delay = float(camera.row_times((camera.height - 1) / 2))
     middle1, middle2 = (motion.rotations([delay])[0] for motion in motions)
-    moved = [camera.project(motion.derotate(camera.unproject(p), camera.row_times(p[:, 1])) @ R)
-             for p, motion, R in zip(points, motions, (middle1, middle2), strict=True)]
+    moved = [
+        camera.project(motion.derotate(camera.unproject(p), camera.row_times(p[:, 1])) @ R)
+        for p, motion, R in zip(points, motions, (middle1, middle2), strict=True)
+    ]
     observed = np.isfinite(np.hstack(moved)).all(axis=1)
     return [p[observed] for p in moved], (middle1, middle2)
 
@@ -206,15 +249,22 @@ def undistorted(points: Array, camera: RollingShutterCamera) -> Array:
     """Pixels (N, 2) of the pinhole camera with the same focal lengths and centre."""
     rays = camera.unproject(points)
     return np.ascontiguousarray(
-        rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+        rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    )
 
 
 OPENCV_ESTIMATORS = {'RANSAC': cv2.RANSAC, 'USAC_MAGSAC': cv2.USAC_MAGSAC}
 
 
-def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
-                      threshold: float, *, estimator: str = 'USAC_MAGSAC',
-                      seed: int = 0) -> Pose | None:
+def opencv_five_point(
+    pixels1: Array,
+    pixels2: Array,
+    camera: RollingShutterCamera,
+    threshold: float,
+    *,
+    estimator: str = 'USAC_MAGSAC',
+    seed: int = 0,
+) -> Pose | None:
     """Pose by OpenCV's essential matrix, as if both images had a global shutter, or None.
 
     `pixels1`, `pixels2` (N, 2): undistorted; `threshold` [px]; `estimator` of `OPENCV_ESTIMATORS`.
@@ -225,28 +275,45 @@ def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCame
     cv2.setRNGSeed(seed)
     try:
         essential, mask = cv2.findEssentialMat(
-            pixels1, pixels2, K, method=OPENCV_ESTIMATORS[estimator], prob=0.999,
-            threshold=threshold)
+            pixels1,
+            pixels2,
+            K,
+            method=OPENCV_ESTIMATORS[estimator],
+            prob=0.999,
+            threshold=threshold,
+        )
         # Several solutions come stacked; none comes as None.
         if np.shape(essential) != (3, 3):
             return None
         count, R, t, _ = cv2.recoverPose(essential, pixels1, pixels2, K, mask=mask)
-    except cv2.error:   # too few, or degenerate
+    except cv2.error:  # too few, or degenerate
         return None
     if not count:
         return None
-    return Pose.of_inverse(np.asarray(R, dtype=np.float64),
-                           np.asarray(t, dtype=np.float64).ravel())
+    return Pose.of_inverse(
+        np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
+    )
 
 
-def poselib_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
-                       threshold: float, *, seed: int = 0) -> Pose | None:
+def poselib_five_point(
+    pixels1: Array,
+    pixels2: Array,
+    camera: RollingShutterCamera,
+    threshold: float,
+    *,
+    seed: int = 0,
+) -> Pose | None:
     """Pose by PoseLib's `estimate_relative_pose` with default options; else as OpenCV's."""
     library: Any = importlib.import_module('poselib')
-    pinhole = {'model': 'PINHOLE', 'width': camera.width, 'height': camera.height,
-               'params': [camera.fx, camera.fy, camera.cx, camera.cy]}
+    pinhole = {
+        'model': 'PINHOLE',
+        'width': camera.width,
+        'height': camera.height,
+        'params': [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
     pose, _ = library.estimate_relative_pose(
-        pixels1, pixels2, pinhole, pinhole, {'max_epipolar_error': threshold, 'seed': seed}, {})
+        pixels1, pixels2, pinhole, pinhole, {'max_epipolar_error': threshold, 'seed': seed}, {}
+    )
     length = np.linalg.norm(pose.t)
     if not length > 0.0:
         return None

@@ -48,12 +48,22 @@ NAME = 'EuRoC imu_april'
 # Calibration of the dataset (cam0 of the VI-Sensor); the bias is fitted (README of the folder)
 # with a lens whose principal point fits these corners, 7 px off the given one.
 _CAMERA = RollingShutterCamera(
-    width=752, height=480, fx=458.654, fy=457.296, cx=367.215, cy=248.375,
-    distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0), readout_time=0.0)
-_BODY_FROM_CAMERA = np.array([
-    [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
-    [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
-    [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949]])
+    width=752,
+    height=480,
+    fx=458.654,
+    fy=457.296,
+    cx=367.215,
+    cy=248.375,
+    distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
+    readout_time=0.0,
+)
+_BODY_FROM_CAMERA = np.array(
+    [
+        [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
+        [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
+        [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949],
+    ]
+)
 _GYRO_BIAS = (-0.0016, 0.0250, 0.0777)
 _CORNERS = 144
 
@@ -65,37 +75,60 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
             files = [archive.extractfile(member) for member in archive if member.isfile()]
             found = [_corners(file.read().decode()) for file in files if file is not None]
         imu = np.loadtxt(folder / 'imu0.csv', delimiter=',', comments='#', usecols=range(1, 7))
-        imu_ns = np.loadtxt(folder / 'imu0.csv', dtype=np.int64, delimiter=',', comments='#',
-                            usecols=0)
-        poses = np.loadtxt(folder / 'gt_pnp_cam0.csv', delimiter=',', skiprows=1,
-                           usecols=range(3, 10))
-        stamps = np.loadtxt(folder / 'gt_pnp_cam0.csv', dtype=np.int64, delimiter=',', skiprows=1,
-                            usecols=0)
+        imu_ns = np.loadtxt(
+            folder / 'imu0.csv', dtype=np.int64, delimiter=',', comments='#', usecols=0
+        )
+        poses = np.loadtxt(
+            folder / 'gt_pnp_cam0.csv', delimiter=',', skiprows=1, usecols=range(3, 10)
+        )
+        stamps = np.loadtxt(
+            folder / 'gt_pnp_cam0.csv', dtype=np.int64, delimiter=',', skiprows=1, usecols=0
+        )
     except OSError as error:
         raise MissingInputError(f"there are no corners of EuRoC's in {folder}: {error}") from error
-    frames = sorted((frame for frame in found if frame is not None),
-                    key=lambda frame: frame[0])
+    frames = sorted((frame for frame in found if frame is not None), key=lambda frame: frame[0])
     stamps_ns, ids, pixels = zip(*frames, strict=True)
-    R = Rotation.from_quat(poses[:, [1, 2, 3, 0]])   # X_cam = R X_target + t
+    R = Rotation.from_quat(poses[:, [1, 2, 3, 0]])  # X_cam = R X_target + t
     truth = TrueTrajectory(stamps, -R.inv().apply(poses[:, 4:]), R.inv().as_quat())
     C = _BODY_FROM_CAMERA[:, :3].T
-    configured = Configured({
-        'readout_time': 0.0, 'gyro_bias': _GYRO_BIAS,
-        'quat_cam_imu_xyzw': tuple(Rotation.from_matrix(C).as_quat().tolist()),
-        'imu_position': tuple((-C @ _BODY_FROM_CAMERA[:, 3]).tolist())}, intrinsics_of(_CAMERA))
+    configured = Configured(
+        {
+            'readout_time': 0.0,
+            'gyro_bias': _GYRO_BIAS,
+            'quat_cam_imu_xyzw': tuple(Rotation.from_matrix(C).as_quat().tolist()),
+            'imu_position': tuple((-C @ _BODY_FROM_CAMERA[:, 3]).tolist()),
+        },
+        intrinsics_of(_CAMERA),
+    )
     zeros = np.zeros((_CORNERS, 2))
     sightings = trust_runs.Sightings(
-        ids, pixels, tuple(map(np.zeros_like, pixels)), np.zeros(len(ids)), zeros, zeros,
-        trust_runs.TrackNoise(white=0.0))
+        ids,
+        pixels,
+        tuple(map(np.zeros_like, pixels)),
+        np.zeros(len(ids)),
+        zeros,
+        zeros,
+        trust_runs.TrackNoise(white=0.0),
+    )
     delay_ns, shape = to_nanoseconds(IMAGE_DELAY), (_CAMERA.height, _CAMERA.width)
     recording = Recording(
-        Source(NAME, trust_runs.TRACKS), configured, _CAMERA,
-        [trust_runs.Arrival(k, stamp_ns, stamp_ns + delay_ns)
-         for k, stamp_ns in enumerate(stamps_ns)],
-        [ImuSample(int(ns), tuple(row[:3].tolist()), tuple(row[3:].tolist()))
-         for ns, row in zip(imu_ns, imu, strict=True)],
-        lambda number: trust_runs.numbered_image(number, shape), sightings,
-        truth.relative_pose, imu_ns, imu[:, :3] @ C.T)
+        Source(NAME, trust_runs.TRACKS),
+        configured,
+        _CAMERA,
+        [
+            trust_runs.Arrival(k, stamp_ns, stamp_ns + delay_ns)
+            for k, stamp_ns in enumerate(stamps_ns)
+        ],
+        [
+            ImuSample(int(ns), tuple(row[:3].tolist()), tuple(row[3:].tolist()))
+            for ns, row in zip(imu_ns, imu, strict=True)
+        ],
+        lambda number: trust_runs.numbered_image(number, shape),
+        sightings,
+        truth.relative_pose,
+        imu_ns,
+        imu[:, :3] @ C.T,
+    )
     return recording, truth
 
 
@@ -129,34 +162,49 @@ class PathMetrics:
     contradicting: int
     lost: int
     at_rest: bool
-    start: float   # [s] from the first pair to the first published keyframe
+    start: float  # [s] from the first pair to the first published keyframe
     live: TrajectoryErrors
     smoothed: TrajectoryErrors
-    nees_position: float   # of published states by degrees of freedom, mean
-    nees_rotation: float   # NaN where the truth has errors of its own
+    nees_position: float  # of published states by degrees of freedom, mean
+    nees_rotation: float  # NaN where the truth has errors of its own
     nees_velocity: float
     # Error of the end after the first 5 s are aligned, by the length of the path [%].
     drift: float
-    processor: float   # of one core, by the graph alone, without messages [%]
+    processor: float  # of one core, by the graph alone, without messages [%]
 
 
-def walks(count: int, first_seed: int, seconds: float = SHORT, *, readout: float | None = None,
-          plan: str = '') -> list[SimulationConfig]:
+def walks(
+    count: int,
+    first_seed: int,
+    seconds: float = SHORT,
+    *,
+    readout: float | None = None,
+    plan: str = '',
+) -> list[SimulationConfig]:
     """Recordings of hand-held walks; scenes alternate, readouts are spread from 12 to 35 ms.
 
     Without a `plan`, they include standstills and pure rotations.
     """
-    return [SimulationConfig(
-        seed=first_seed + k, scene=SCENES[k % len(SCENES)], duration=seconds, plan=plan,
-        readout_time=round(0.012 + 0.023 * k / max(count - 1, 1), 4) if readout is None
-        else readout) for k in range(count)]
+    return [
+        SimulationConfig(
+            seed=first_seed + k,
+            scene=SCENES[k % len(SCENES)],
+            duration=seconds,
+            plan=plan,
+            readout_time=round(0.012 + 0.023 * k / max(count - 1, 1), 4)
+            if readout is None
+            else readout,
+        )
+        for k in range(count)
+    ]
 
 
 def on_walk(config: SimulationConfig) -> PathMetrics:
     """Odometry of a simulated recording."""
     simulation = simulate(config)
-    recording = trust_runs.walk_of(simulation, np.random.default_rng(config.seed),
-                                   ', in motion' if config.plan else '')
+    recording = trust_runs.walk_of(
+        simulation, np.random.default_rng(config.seed), ', in motion' if config.plan else ''
+    )
     return on_recording(recording, odometry_disturbances.true_states(simulation))
 
 
@@ -165,8 +213,9 @@ def on_euroc(folder: Path, picture: Path) -> PathMetrics:
     return on_recording(*read_euroc(folder), picture=picture)
 
 
-def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
-                 picture: Path | None = None) -> PathMetrics:
+def on_recording(
+    recording: Recording, truth: TrueStates | TrueTrajectory, *, picture: Path | None = None
+) -> PathMetrics:
     """Odometry of a recording's pairs and samples; NEES if the truth is that of a simulation."""
     # Before: the time of the front end does not count.
     feed = odometry_disturbances.feed_of(recording)
@@ -190,10 +239,20 @@ def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
         offline.draw_paths(paths, picture)
     first = estimator.starts[0]
     return PathMetrics(
-        recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
-        len(feed.pairs), estimator.counts['contradicting'], estimator.counts['lost'],
-        first.at_rest, first.seconds, errors[0], errors[1], *nees, drift(live, truth),
-        100.0 * processor / recording.seconds)
+        recording.source.name,
+        1e3 * recording.camera.readout_time,
+        recording.seconds,
+        len(feed.pairs),
+        estimator.counts['contradicting'],
+        estimator.counts['lost'],
+        first.at_rest,
+        first.seconds,
+        errors[0],
+        errors[1],
+        *nees,
+        drift(live, truth),
+        100.0 * processor / recording.seconds,
+    )
 
 
 def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
@@ -209,17 +268,50 @@ def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
 
 def write_report(folder: Path, paths: Sequence[PathMetrics]) -> str:
     """Write the metrics (CSV) and the report (Markdown), and return the latter."""
-    return write_table(folder, 'odometry', paths, markdown_table(
-        ('recording', 'readout [ms]', 'length [m]', 'started [s]', 'live: ATE [m]', 'scale [%]',
-         'over 1 m [%]', 'smoothed: ATE', 'scale', 'over 1 m', 'NEES: position',
-         'rotation', 'velocity', 'drift [%]', 'core [%]', 'left out'),
-        [(f'{p.name}, {p.seconds:.0f} s', f'{p.readout_ms:.1f}', f'{p.live.length_m:.1f}',
-          f'{p.start:.1f}' + (' at rest' if p.at_rest else ''), *_errors(p.live),
-          *_errors(p.smoothed), *(_known(value) for value in (
-              p.nees_position, p.nees_rotation, p.nees_velocity)), f'{p.drift:.3f}',
-          f'{p.processor:.1f}',
-          f'{p.contradicting} of {p.pairs}' + (f', lost {p.lost} times' if p.lost else ''))
-         for p in paths]))
+    return write_table(
+        folder,
+        'odometry',
+        paths,
+        markdown_table(
+            (
+                'recording',
+                'readout [ms]',
+                'length [m]',
+                'started [s]',
+                'live: ATE [m]',
+                'scale [%]',
+                'over 1 m [%]',
+                'smoothed: ATE',
+                'scale',
+                'over 1 m',
+                'NEES: position',
+                'rotation',
+                'velocity',
+                'drift [%]',
+                'core [%]',
+                'left out',
+            ),
+            [
+                (
+                    f'{p.name}, {p.seconds:.0f} s',
+                    f'{p.readout_ms:.1f}',
+                    f'{p.live.length_m:.1f}',
+                    f'{p.start:.1f}' + (' at rest' if p.at_rest else ''),
+                    *_errors(p.live),
+                    *_errors(p.smoothed),
+                    *(
+                        _known(value)
+                        for value in (p.nees_position, p.nees_rotation, p.nees_velocity)
+                    ),
+                    f'{p.drift:.3f}',
+                    f'{p.processor:.1f}',
+                    f'{p.contradicting} of {p.pairs}'
+                    + (f', lost {p.lost} times' if p.lost else ''),
+                )
+                for p in paths
+            ],
+        ),
+    )
 
 
 def _known(value: float) -> str:
@@ -227,5 +319,8 @@ def _known(value: float) -> str:
 
 
 def _errors(errors: TrajectoryErrors) -> tuple[str, str, str]:
-    return (f'{errors.ate_m:.3f}', f'{100.0 * errors.scale_error:+.2f}',
-            f'{errors.relative_translation_error_percent:.2f}')
+    return (
+        f'{errors.ate_m:.3f}',
+        f'{100.0 * errors.scale_error:+.2f}',
+        f'{errors.relative_translation_error_percent:.2f}',
+    )

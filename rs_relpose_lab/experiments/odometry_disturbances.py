@@ -46,19 +46,21 @@ class Disturbance(NamedTuple):
     """What happens from `_MARGIN` on for some seconds."""
 
     seconds: float
-    images: bool = True   # whether they arrive
-    samples: bool = True   # likewise
-    corners: float = 1.0   # share of the corners in sight
-    white: float = 1.0   # factor of their noise
-    lost: float = 0.0   # share of them that is lost from frame to frame
-    object_speed: float = 0.0   # [px/s] of an object that covers half of the image
-    plan: str = 'walk'   # of the motion
+    images: bool = True  # whether they arrive
+    samples: bool = True  # likewise
+    corners: float = 1.0  # share of the corners in sight
+    white: float = 1.0  # factor of their noise
+    lost: float = 0.0  # share of them that is lost from frame to frame
+    object_speed: float = 0.0  # [px/s] of an object that covers half of the image
+    plan: str = 'walk'  # of the motion
 
 
 DISTURBANCES = {
     'none': Disturbance(2.0),
-    **{f'no images, {seconds:g} s': Disturbance(seconds, images=False)
-       for seconds in (0.8, 2.0, 5.0)},
+    **{
+        f'no images, {seconds:g} s': Disturbance(seconds, images=False)
+        for seconds in (0.8, 2.0, 5.0)
+    },
     **{f'no texture, {seconds:g} s': Disturbance(seconds, corners=0.0) for seconds in (2.0, 5.0)},
     'blur, 2 s': Disturbance(2.0, white=12.0, lost=0.2),
     'darkness, 4 s': Disturbance(4.0, corners=0.06, white=8.0, lost=0.05),
@@ -69,25 +71,50 @@ DISTURBANCES = {
 }
 
 
-def disturbed(recording: Recording, simulation: Simulation, what: Disturbance,
-              rng: np.random.Generator) -> Recording:
+def disturbed(
+    recording: Recording, simulation: Simulation, what: Disturbance, rng: np.random.Generator
+) -> Recording:
     """The recording with a disturbance."""
     first_ns = simulation.config.start_ns
     begin_ns, end_ns = (first_ns + to_nanoseconds(at) for at in (_MARGIN, _MARGIN + what.seconds))
     assert recording.sightings is not None
-    within = [begin_ns <= simulation.reference_ns(arrival.number) < end_ns
-              for arrival in recording.arrivals]
-    arrivals = [arrival for arrival, there in zip(recording.arrivals, within, strict=True)
-                if what.images or not there]
-    samples = [sample for sample in recording.samples
-               if what.samples or not begin_ns <= sample.stamp_ns < end_ns]
-    return replace(recording, arrivals=arrivals, samples=samples, sightings=_other_sightings(
-        recording.sightings, np.flatnonzero(within) / simulation.config.fps,
-        int(np.argmax(within)), what, 0.5 * simulation.config.width, rng))
+    within = [
+        begin_ns <= simulation.reference_ns(arrival.number) < end_ns
+        for arrival in recording.arrivals
+    ]
+    arrivals = [
+        arrival
+        for arrival, there in zip(recording.arrivals, within, strict=True)
+        if what.images or not there
+    ]
+    samples = [
+        sample
+        for sample in recording.samples
+        if what.samples or not begin_ns <= sample.stamp_ns < end_ns
+    ]
+    return replace(
+        recording,
+        arrivals=arrivals,
+        samples=samples,
+        sightings=_other_sightings(
+            recording.sightings,
+            np.flatnonzero(within) / simulation.config.fps,
+            int(np.argmax(within)),
+            what,
+            0.5 * simulation.config.width,
+            rng,
+        ),
+    )
 
 
-def _other_sightings(known: trust_runs.Sightings, seconds: Array, first: int, what: Disturbance,
-                     half: float, rng: np.random.Generator) -> trust_runs.Sightings:
+def _other_sightings(
+    known: trust_runs.Sightings,
+    seconds: Array,
+    first: int,
+    what: Disturbance,
+    half: float,
+    rng: np.random.Generator,
+) -> trust_runs.Sightings:
     """Sightings with those of a disturbance from frame `first` on, at `seconds` (K,).
 
     Its corners, and those after it, are other ones than before.
@@ -101,7 +128,7 @@ def _other_sightings(known: trust_runs.Sightings, seconds: Array, first: int, wh
     appeared, known_until = np.full(count, np.nan), np.zeros(count, dtype=bool)
     for k, at in zip(range(first, last), seconds, strict=True):
         kept = in_sight[ids[k]] & (rng.uniform(size=len(ids[k])) >= what.lost)
-        kept[:1] = True   # a tracker of nothing has no image
+        kept[:1] = True  # a tracker of nothing has no image
         new = ~known_until[ids[k]]
         known_until[ids[k]] = True
         if what.object_speed:
@@ -111,11 +138,18 @@ def _other_sightings(known: trust_runs.Sightings, seconds: Array, first: int, wh
         ids[k], noise[k] = ids[k][kept] + count, what.white * noise[k][kept]
     for k in range(last, len(ids)):
         ids[k] = ids[k] + 2 * count
-    return replace(known, ids=tuple(ids), pixels=tuple(pixels), noise=tuple(noise),
-                   slips=np.tile(known.slips, (3, 1)), slides=np.tile(known.slides, (3, 1)))
+    return replace(
+        known,
+        ids=tuple(ids),
+        pixels=tuple(pixels),
+        noise=tuple(noise),
+        slips=np.tile(known.slips, (3, 1)),
+        slides=np.tile(known.slides, (3, 1)),
+    )
 
 
 # -- states as the node publishes them --------------------------------------------------------
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueStates:
@@ -129,14 +163,15 @@ class TrueStates:
     @property
     def trajectory(self) -> TrueTrajectory:
         """Its poses."""
-        return TrueTrajectory(self.stamps_ns, self.position,
-                              Rotation.from_matrix(self.R).as_quat())
+        return TrueTrajectory(
+            self.stamps_ns, self.position, Rotation.from_matrix(self.R).as_quat()
+        )
 
 
 class Feed(NamedTuple):
     """Input of the odometry, with arrivals [ns]: pairs, samples, stamps of frames."""
 
-    values: Mapping[str, Any]   # of the parameters
+    values: Mapping[str, Any]  # of the parameters
     pairs: list[tuple[int, KeyframePair]]
     samples: list[tuple[int, ImuSample]]
     frames: list[tuple[int, int]]
@@ -145,19 +180,25 @@ class Feed(NamedTuple):
 def feed_of(recording: Recording) -> Feed:
     """Pairs of the front end on a recording, and its samples."""
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
-    pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
-             for pair, _ in trust_runs.run(recording, recording.configured)]
+    pairs = [
+        (arrives[pair.stamp_ns], KeyframePair.of_result(pair))
+        for pair, _ in trust_runs.run(recording, recording.configured)
+    ]
     delay_ns = to_nanoseconds(IMU_DELAY)
-    return Feed(recording.configured.values, pairs,
-                [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples],
-                [(arrives_ns, stamp_ns) for stamp_ns, arrives_ns in arrives.items()])
+    return Feed(
+        recording.configured.values,
+        pairs,
+        [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples],
+        [(arrives_ns, stamp_ns) for stamp_ns, arrives_ns in arrives.items()],
+    )
 
 
 def true_states(simulation: Simulation) -> TrueStates:
     """The camera of a simulation."""
     states = simulation.states(simulation.imu.stamps_ns)
-    return TrueStates(simulation.imu.stamps_ns, states.position, states.R_world_cam,
-                      states.velocity)
+    return TrueStates(
+        simulation.imu.stamps_ns, states.position, states.R_world_cam, states.velocity
+    )
 
 
 def published(estimator: OdometryEstimator, feed: Feed) -> Iterator[Odometry]:
@@ -194,12 +235,22 @@ def errors_squared(states: Sequence[Odometry], first: Odometry, truth: TrueState
     found = []
     for state, row in zip(states, rows, strict=True):
         R = turn @ truth.R[row]
-        errors = (state.position - first.position - turn @ (truth.position[row] - origin[0]),
-                  log_so3(state.R @ R.T), state.velocity - truth.R[row].T @ truth.velocity[row])
-        blocks = (state.pose_covariance[:3, :3], state.pose_covariance[3:, 3:],
-                  state.velocity_covariance[:3, :3])
-        found.append([error @ np.linalg.solve(block, error)
-                      for error, block in zip(errors, blocks, strict=True)])
+        errors = (
+            state.position - first.position - turn @ (truth.position[row] - origin[0]),
+            log_so3(state.R @ R.T),
+            state.velocity - truth.R[row].T @ truth.velocity[row],
+        )
+        blocks = (
+            state.pose_covariance[:3, :3],
+            state.pose_covariance[3:, 3:],
+            state.velocity_covariance[:3, :3],
+        )
+        found.append(
+            [
+                error @ np.linalg.solve(block, error)
+                for error, block in zip(errors, blocks, strict=True)
+            ]
+        )
     return np.reshape(found, (-1, 3))
 
 
@@ -208,11 +259,14 @@ def _interpolated(truth: TrueStates, at_ns: int) -> tuple[Array, Array]:
     k = int(np.searchsorted(truth.stamps_ns, at_ns))
     part = (at_ns - truth.stamps_ns[k - 1]) / (truth.stamps_ns[k] - truth.stamps_ns[k - 1])
     step = Rotation.from_matrix(truth.R[k - 1].T @ truth.R[k]).as_rotvec()
-    return (truth.position[k - 1] + part * (truth.position[k] - truth.position[k - 1]),
-            truth.R[k - 1] @ Rotation.from_rotvec(part * step).as_matrix())
+    return (
+        truth.position[k - 1] + part * (truth.position[k] - truth.position[k - 1]),
+        truth.R[k - 1] @ Rotation.from_rotvec(part * step).as_matrix(),
+    )
 
 
 # -- results ----------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True, slots=True)
 class DisturbedRun:
@@ -220,15 +274,15 @@ class DisturbedRun:
 
     name: str
     seed: int
-    states: int   # from its begin on
-    beyond_position: int   # states whose error is beyond the 99.7 % quantile
+    states: int  # from its begin on
+    beyond_position: int  # states whose error is beyond the 99.7 % quantile
     beyond_rotation: int
     beyond_velocity: int
-    velocity_ratio: float   # of the sigmas 2 s after it and before it; NaN without a state
-    tilt_ratio: float   # likewise
-    uncertain_after: float   # [s] from the last usable pair before it; NaN if never
+    velocity_ratio: float  # of the sigmas 2 s after it and before it; NaN without a state
+    tilt_ratio: float  # likewise
+    uncertain_after: float  # [s] from the last usable pair before it; NaN if never
     lost: int
-    largest_step: float   # between published states, in sigmas of the position
+    largest_step: float  # between published states, in sigmas of the position
 
 
 def tasks(seeds: int, first_seed: int) -> list[tuple[str, int]]:
@@ -248,9 +302,12 @@ def measure(task: tuple[str, int]) -> DisturbedRun:
 def configuration(what: Disturbance, seed: int) -> SimulationConfig:
     """The walk of a seed, with the motion of a disturbance."""
     return SimulationConfig(
-        seed=seed, scene=SCENES[seed % len(SCENES)], readout_time=0.02,
+        seed=seed,
+        scene=SCENES[seed % len(SCENES)],
+        readout_time=0.02,
         duration=2.0 * _MARGIN + what.seconds,
-        plan=f'walk:{_MARGIN:g},{what.plan}:{what.seconds:g},walk:{_MARGIN:g}')
+        plan=f'walk:{_MARGIN:g},{what.plan}:{what.seconds:g},walk:{_MARGIN:g}',
+    )
 
 
 def on_feed(name: str, seed: int, feed: Feed, truth: TrueStates) -> DisturbedRun:
@@ -265,18 +322,33 @@ def on_feed(name: str, seed: int, feed: Feed, truth: TrueStates) -> DisturbedRun
     begin, end = _MARGIN, _MARGIN + DISTURBANCES[name].seconds
     before = _sigmas(states, at, begin - 0.5)
     after = _sigmas(states, at, end + NORMAL_AGAIN)
-    used = max(_seconds(pair.current_ns) for _, pair in feed.pairs
-               if pair.images is not None and _seconds(pair.current_ns) < begin)
-    uncertain = [_seconds(one.begin_ns) - used for one in estimator.intervals
-                 if one.state in (OdometryState.UNCERTAIN, OdometryState.LOST)
-                 and begin - 0.1 < _seconds(one.begin_ns) < end + 0.3]
+    used = max(
+        _seconds(pair.current_ns)
+        for _, pair in feed.pairs
+        if pair.images is not None and _seconds(pair.current_ns) < begin
+    )
+    uncertain = [
+        _seconds(one.begin_ns) - used
+        for one in estimator.intervals
+        if one.state in (OdometryState.UNCERTAIN, OdometryState.LOST)
+        and begin - 0.1 < _seconds(one.begin_ns) < end + 0.3
+    ]
     counted = at > begin
     position, rotation, velocity = beyond[counted].sum(axis=0).tolist()
     of_velocity, of_tilt = (after / before).tolist()
     return DisturbedRun(
-        name, seed, int(counted.sum()), position, rotation, velocity, of_velocity, of_tilt,
-        min(uncertain, default=math.nan), estimator.counts['lost'],
-        max(_step(one, two) for one, two in pairwise(states) if one.path == two.path))
+        name,
+        seed,
+        int(counted.sum()),
+        position,
+        rotation,
+        velocity,
+        of_velocity,
+        of_tilt,
+        min(uncertain, default=math.nan),
+        estimator.counts['lost'],
+        max(_step(one, two) for one, two in pairwise(states) if one.path == two.path),
+    )
 
 
 def _seconds(at_ns: int) -> float:
@@ -285,9 +357,11 @@ def _seconds(at_ns: int) -> float:
 
 def _sigmas(states: Sequence[Odometry], at: Array, seconds: float) -> Array:
     """Sigmas of velocity and tilt in the half second before a time; NaN without a state."""
-    found = [(np.trace(state.velocity_covariance[:3, :3]),
-              np.trace(state.pose_covariance[3:5, 3:5]))
-             for state, when in zip(states, at, strict=True) if seconds - 0.5 < when <= seconds]
+    found = [
+        (np.trace(state.velocity_covariance[:3, :3]), np.trace(state.pose_covariance[3:5, 3:5]))
+        for state, when in zip(states, at, strict=True)
+        if seconds - 0.5 < when <= seconds
+    ]
     return np.sqrt(np.mean(found, axis=0)) if found else np.full(2, math.nan)
 
 
@@ -309,15 +383,39 @@ def write_report(folder: Path, runs: Sequence[DisturbedRun]) -> str:
     rows = []
     for name, of_one in [*grouped(runs, lambda one: one.name).items(), ('all', list(runs))]:
         states = sum(one.states for one in of_one)
-        rows.append((
-            name, str(len(of_one)), *(
-                f'{100.0 * sum(getattr(one, f"beyond_{key}") for one in of_one) / states:.1f}'
-                for key in ('position', 'rotation', 'velocity')),
-            *(_largest(getattr(one, key) for one in of_one) for key in (
-                'velocity_ratio', 'tilt_ratio', 'uncertain_after')),
-            str(sum(one.lost for one in of_one)),
-            f'{max(one.largest_step for one in of_one):.2f}'))
-    return write_table(folder, 'odometry_disturbances', runs, markdown_table(
-        ('disturbance', 'walks', 'beyond 99.7 %: position [%]', 'rotation', 'velocity',
-         'sigma after by before: velocity', 'tilt', 'uncertain after [s]', 'lost',
-         'largest step [sigma]'), rows))
+        rows.append(
+            (
+                name,
+                str(len(of_one)),
+                *(
+                    f'{100.0 * sum(getattr(one, f"beyond_{key}") for one in of_one) / states:.1f}'
+                    for key in ('position', 'rotation', 'velocity')
+                ),
+                *(
+                    _largest(getattr(one, key) for one in of_one)
+                    for key in ('velocity_ratio', 'tilt_ratio', 'uncertain_after')
+                ),
+                str(sum(one.lost for one in of_one)),
+                f'{max(one.largest_step for one in of_one):.2f}',
+            )
+        )
+    return write_table(
+        folder,
+        'odometry_disturbances',
+        runs,
+        markdown_table(
+            (
+                'disturbance',
+                'walks',
+                'beyond 99.7 %: position [%]',
+                'rotation',
+                'velocity',
+                'sigma after by before: velocity',
+                'tilt',
+                'uncertain after [s]',
+                'lost',
+                'largest step [sigma]',
+            ),
+            rows,
+        ),
+    )

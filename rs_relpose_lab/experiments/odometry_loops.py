@@ -50,7 +50,7 @@ class LoopMetrics:
     offered: int
     related: int
     taken: int
-    worst: float   # largest chi squared of the taken loops, by its 3 sigma bound; NaN without
+    worst: float  # largest chi squared of the taken loops, by its 3 sigma bound; NaN without
     end_without: float
     end: float
     rotation_without: float
@@ -67,15 +67,21 @@ def closed(trajectory: Trajectory, seconds: float) -> Trajectory:
     angles = trajectory.angles.copy()
     heading = math.atan2(R1[1, 2], R1[0, 2]) - math.atan2(R2[1, 2], R2[0, 2])
     angles[:, 0] += share * (2.0 * math.pi + heading)
-    return replace(trajectory, angles=angles,
-                   positions=trajectory.positions + np.outer(share, begin - end))
+    return replace(
+        trajectory, angles=angles, positions=trajectory.positions + np.outer(share, begin - end)
+    )
 
 
 def on_seed(seed: int) -> LoopMetrics:
     """Loop closures on the walk of a seed, in rooms: other scenes are open behind the camera."""
     config = SimulationConfig(
-        seed=seed, scene=('hall', 'gallery')[seed % 2], duration=SECONDS, fps=20.0,
-        readout_time=0.02, plan=f'walk:{SECONDS:g}')
+        seed=seed,
+        scene=('hall', 'gallery')[seed % 2],
+        duration=SECONDS,
+        fps=20.0,
+        readout_time=0.02,
+        plan=f'walk:{SECONDS:g}',
+    )
     return on_walk(config, closed(simulate(config).trajectory, SECONDS))
 
 
@@ -92,24 +98,37 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
         pairs.append((arrives[pair.stamp_ns], given))
     estimator = OdometryEstimator(parameters, keep=True)
     delay_ns = to_nanoseconds(IMU_DELAY)
-    follow(estimator, pairs, [(sample.stamp_ns + delay_ns, sample)
-                              for sample in recording.samples])
+    follow(
+        estimator, pairs, [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples]
+    )
     before = estimator.smoothed_paths()
     sensor = sensor_model(recording.configured.intrinsics, parameters.sensor)
-    after, report, taken = close_loops(estimator, before, views, sensor, lambda stamps: _related(
-        recording, simulation, stamps))
+    after, report, taken = close_loops(
+        estimator, before, views, sensor, lambda stamps: _related(recording, simulation, stamps)
+    )
     truth = true_states(simulation).trajectory
     (end1, turn1, ate1), (end2, turn2, ate2) = (
-        _errors([pose for path in paths for _, pose in path], truth) for paths in (before, after))
+        _errors([pose for path in paths for _, pose in path], truth) for paths in (before, after)
+    )
     return LoopMetrics(
-        recording.source.name, sum(map(len, before)), report['offered'],
-        report['related'], report['taken'],
+        recording.source.name,
+        sum(map(len, before)),
+        report['offered'],
+        report['related'],
+        report['taken'],
         max((_misfit(pair, simulation) for pair in taken), default=math.nan),
-        end1, end2, turn1, turn2, ate1, ate2)
+        end1,
+        end2,
+        turn1,
+        turn2,
+        ate1,
+        ate2,
+    )
 
 
-def _related(recording: Recording, simulation: Simulation,
-             stamps: list[Stamps]) -> list[PairResult]:
+def _related(
+    recording: Recording, simulation: Simulation, stamps: list[Stamps]
+) -> list[PairResult]:
     """Pairs of rendered images."""
     wanted = {stamp for pair in stamps for stamp in pair}
     blank = np.zeros((simulation.config.height, simulation.config.width), dtype=np.uint8)
@@ -121,8 +140,9 @@ def _related(recording: Recording, simulation: Simulation,
     warm_up(parameters.estimator)
     loop = FrameLoop(parameters, ChosenPairs(stamps), offline=True)
     found: dict[Stamps, PairResult | str] = {}
-    for frame in trust_runs.processed(replace(recording, image=image, sightings=None),
-                           recording.configured, loop):
+    for frame in trust_runs.processed(
+        replace(recording, image=image, sightings=None), recording.configured, loop
+    ):
         found.update(frame.result or {})
     return [pair for pair in found.values() if isinstance(pair, PairResult)]
 
@@ -135,31 +155,76 @@ def _errors(path: Sequence[Odometry], truth: TrueTrajectory) -> tuple[float, flo
     if true is None or errors is None:
         raise InputError('the truth does not cover the path')
     turn = log_so3(first.R.T @ last.R @ true[0].T)
-    return (float(np.linalg.norm(first.R.T @ (last.position - first.position) - true[1])),
-            math.degrees(float(np.linalg.norm(turn))), errors.ate_m)
+    return (
+        float(np.linalg.norm(first.R.T @ (last.position - first.position) - true[1])),
+        math.degrees(float(np.linalg.norm(turn))),
+        errors.ate_m,
+    )
 
 
 def _misfit(pair: KeyframePair, simulation: Simulation) -> float:
     """Chi squared of a loop at the true poses, by its 3 sigma bound."""
     states, images = simulation.states([pair.reference_ns, pair.current_ns]), pair.images
     assert images is not None
-    bodies = [(np.ascontiguousarray(states.R_world_cam[k]), states.position[k],
-               states.velocity[k], states.angular_velocity[k]) for k in range(2)]
+    bodies = [
+        (
+            np.ascontiguousarray(states.R_world_cam[k]),
+            states.position[k],
+            states.velocity[k],
+            states.angular_velocity[k],
+        )
+        for k in range(2)
+    ]
     A, a = square_root(images.information, images.gradient)
     deviation, _ = deviations(
-        *bodies[0], *bodies[1], np.eye(3), np.zeros(3), images.R,
-        np.nan_to_num(images.t, nan=1.0), np.zeros(6))
-    error = A @ deviation[:A.shape[1]] + a
+        *bodies[0],
+        *bodies[1],
+        np.eye(3),
+        np.zeros(3),
+        images.R,
+        np.nan_to_num(images.t, nan=1.0),
+        np.zeros(6),
+    )
+    error = A @ deviation[: A.shape[1]] + a
     return float(error @ error) / float(chi2.isf(_BEYOND, len(error)))
 
 
 def write_report(folder: Path, walks: Sequence[LoopMetrics]) -> str:
     """Write the metrics (CSV) and the report (Markdown), and return the latter."""
-    return write_table(folder, 'odometry_loops', walks, markdown_table(
-        ('walk', 'keyframes', 'loops offered', 'related', 'taken', 'worst [3 sigma]',
-         'end: without [m]', 'with [m]', 'ratio', 'without [deg]', 'with [deg]',
-         'ATE: without [m]', 'with [m]'),
-        [(one.name, *map(str, (one.keyframes, one.offered, one.related, one.taken)),
-          f'{one.worst:.2f}', f'{one.end_without:.4f}', f'{one.end:.4f}',
-          f'{one.end / one.end_without:.2f}', f'{one.rotation_without:.3f}',
-          f'{one.rotation:.3f}', f'{one.ate_without:.4f}', f'{one.ate:.4f}') for one in walks]))
+    return write_table(
+        folder,
+        'odometry_loops',
+        walks,
+        markdown_table(
+            (
+                'walk',
+                'keyframes',
+                'loops offered',
+                'related',
+                'taken',
+                'worst [3 sigma]',
+                'end: without [m]',
+                'with [m]',
+                'ratio',
+                'without [deg]',
+                'with [deg]',
+                'ATE: without [m]',
+                'with [m]',
+            ),
+            [
+                (
+                    one.name,
+                    *map(str, (one.keyframes, one.offered, one.related, one.taken)),
+                    f'{one.worst:.2f}',
+                    f'{one.end_without:.4f}',
+                    f'{one.end:.4f}',
+                    f'{one.end / one.end_without:.2f}',
+                    f'{one.rotation_without:.3f}',
+                    f'{one.rotation:.3f}',
+                    f'{one.ate_without:.4f}',
+                    f'{one.ate:.4f}',
+                )
+                for one in walks
+            ],
+        ),
+    )

@@ -75,23 +75,25 @@ class Objective:
     """
 
     problem: TwoViewProblem
-    pixel_sigma: float   # [px] per coordinate
-    gravity_sigma: float   # [rad] per axis of one frame's direction
-    gyro_sigma: float   # [rad/s] per axis of one frame
+    pixel_sigma: float  # [px] per coordinate
+    gravity_sigma: float  # [rad] per axis of one frame's direction
+    gyro_sigma: float  # [rad/s] per axis of one frame
     start: Start
 
     @property
     def velocity_spread(self) -> float:
         """Root mean square of the true velocities' components [baselines per second]."""
-        return float(np.sqrt((self.problem.v1 @ self.problem.v1
-                              + self.problem.v2 @ self.problem.v2) / 6.0))
+        return float(
+            np.sqrt((self.problem.v1 @ self.problem.v1 + self.problem.v2 @ self.problem.v2) / 6.0)
+        )
 
     def truth(self) -> Array:
         """The unknowns (P,) of the true gyro corrections and velocities, at the start's pose."""
         problem = self.problem
         x = np.zeros(19 if self.velocity_spread > 0.0 else 13)
-        x[_GYRO] = np.concatenate([problem.w1 - problem.measured_rate1,
-                                   problem.w2 - problem.measured_rate2])
+        x[_GYRO] = np.concatenate(
+            [problem.w1 - problem.measured_rate1, problem.w2 - problem.measured_rate2]
+        )
         if self.velocity_spread > 0.0:
             x[_VELOCITY] = np.concatenate([problem.v1, problem.v2])
         return x
@@ -104,13 +106,22 @@ class Objective:
         gravity2 = np.einsum('jik,jk->ik', R, gravity)
         gyro = x[_GYRO]
         velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
-        errors = _sampson(problem.points1[use], problem.points2[use], R, t,
-                          problem.measured_rate1[:, None] + gyro[:3],
-                          problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
-        parts = [errors / self.pixel_sigma,
-                 _tangent(problem.measured_gravity1).T @ gravity / self.gravity_sigma,
-                 _tangent(problem.measured_gravity2).T @ gravity2 / self.gravity_sigma,
-                 gyro / self.gyro_sigma]
+        errors = _sampson(
+            problem.points1[use],
+            problem.points2[use],
+            R,
+            t,
+            problem.measured_rate1[:, None] + gyro[:3],
+            problem.measured_rate2[:, None] + gyro[3:],
+            velocity[:3],
+            velocity[3:],
+        )
+        parts = [
+            errors / self.pixel_sigma,
+            _tangent(problem.measured_gravity1).T @ gravity / self.gravity_sigma,
+            _tangent(problem.measured_gravity2).T @ gravity2 / self.gravity_sigma,
+            gyro / self.gyro_sigma,
+        ]
         if spread > 0.0:
             parts.append(velocity / spread)
         return np.concatenate(parts)
@@ -121,15 +132,30 @@ class Objective:
         return np.imag(self.residuals(columns)) / _STEP
 
 
-def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: float,
-                    gyro_sigma: float, start: tuple[Array, Array] | None = None) -> OracleEstimate:
+def oracle_estimate(
+    problem: TwoViewProblem,
+    pixel_sigma: float,
+    gravity_sigma: float,
+    gyro_sigma: float,
+    start: tuple[Array, Array] | None = None,
+) -> OracleEstimate:
     """The oracle's estimate of a problem; `start`: pose to start from instead of the truth."""
     R, t = (problem.R, problem.t) if start is None else start
-    objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,
-                          start_at(R, t, problem.gravity1))
-    x = np.array(least_squares(
-        lambda x: objective.residuals(x[:, None])[:, 0], objective.truth(),
-        jac=objective.jacobian, method='lm', x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
+    objective = Objective(
+        problem, pixel_sigma, gravity_sigma, gyro_sigma, start_at(R, t, problem.gravity1)
+    )
+    x = np.array(
+        least_squares(
+            lambda x: objective.residuals(x[:, None])[:, 0],
+            objective.truth(),
+            jac=objective.jacobian,
+            method='lm',
+            x_scale='jac',
+            xtol=1e-12,
+            ftol=1e-12,
+            gtol=1e-12,
+        ).x
+    )
     R, t, gravity = pose_at(objective.start, x[:, None])
     # Linearised again at the optimum, where the unknowns of the pose are a rotation and a tangent.
     optimum = start_at(R[:, :, 0], t[:, 0], gravity[:, 0])
@@ -145,16 +171,24 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
 def pose_at(origin: Start, x: Values) -> tuple[Values, Values, Values]:
     """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
     series = _series(x[:3], np.ones(1))
-    R = np.stack([_rotate(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],
-                 axis=1)
+    R = np.stack(
+        [_rotate(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T], axis=1
+    )
     t = origin.t[:, None] + origin.tangent @ x[3:5]
     gravity = origin.gravity[:, None] + origin.gravity_tangent @ x[_GRAVITY]
     return R, t / np.sqrt((t * t).sum(axis=0)), gravity / np.sqrt((gravity * gravity).sum(axis=0))
 
 
-def _sampson(points1: Array, points2: Array, R: Values, t: Values,
-             w1: Values, w2: Values, v1: Values, v2: Values,
-             ) -> Values:
+def _sampson(
+    points1: Array,
+    points2: Array,
+    R: Values,
+    t: Values,
+    w1: Values,
+    w2: Values,
+    v1: Values,
+    v2: Values,
+) -> Values:
     """Signed Sampson errors (N, K) [px] of the uniform rolling-shutter model.
 
     `R` is (3, 3, K); `t`, `w1`, `w2`, `v1`, `v2` are (3, K).
@@ -177,8 +211,13 @@ def _sampson(points1: Array, points2: Array, R: Values, t: Values,
 def _derotated(points: Array, w: Values) -> tuple[tuple[Values, Values, Values], Array]:
     """Derotated rays (3, K, N), their derivatives by u and v, and row times (N,)."""
     tau = LINE_DELAY * points[:, 1]
-    m = np.stack([(points[:, 0] - CENTRE_U) / FOCAL, (points[:, 1] - CENTRE_V) / FOCAL,
-                  np.ones(len(points))])[:, None]
+    m = np.stack(
+        [
+            (points[:, 0] - CENTRE_U) / FOCAL,
+            (points[:, 1] - CENTRE_V) / FOCAL,
+            np.ones(len(points)),
+        ]
+    )[:, None]
     along_u, along_v = np.array([1.0, 0.0, 0.0]) / FOCAL, np.array([0.0, 1.0, 0.0]) / FOCAL
     series = _series(w, tau)
     f = _rotate(w, m, series)
@@ -211,8 +250,9 @@ def _rotate(w: Values, m: Array, series: tuple[Values, Values]) -> Values:
 
 
 def _cross(a: Values, b: Values) -> Values:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
-                     a[0] * b[1] - a[1] * b[0]])
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def _dot(a: Values, b: Values) -> Values:

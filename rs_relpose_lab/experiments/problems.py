@@ -36,10 +36,16 @@ FOCAL = 640.0
 CENTRE_U, CENTRE_V = 959.5, 539.5
 LINE_DELAY = 60e-6
 
-VIEW = View(lambda local: FOCAL * local[:, :2] / local[:, 2:] + (CENTRE_U, CENTRE_V),
-            lambda pixels: np.column_stack([(pixels - (CENTRE_U, CENTRE_V)) / FOCAL,
-                                            np.ones(len(pixels))]),
-            WIDTH, HEIGHT, LINE_DELAY, reference_row=0.0)
+VIEW = View(
+    lambda local: FOCAL * local[:, :2] / local[:, 2:] + (CENTRE_U, CENTRE_V),
+    lambda pixels: np.column_stack(
+        [(pixels - (CENTRE_U, CENTRE_V)) / FOCAL, np.ones(len(pixels))]
+    ),
+    WIDTH,
+    HEIGHT,
+    LINE_DELAY,
+    reference_row=0.0,
+)
 
 BASELINES = {'forward': (0.0, 0.0, 2.0), 'sideways': (2.0, 0.0, 0.0)}  # [m]
 _DEPTHS = 6.0, 34.0  # [m]
@@ -49,14 +55,14 @@ _DEPTHS = 6.0, 34.0  # [m]
 class Cell:
     """One setting of an experiment; the defaults are the base cell of the benchmark."""
 
-    direction: str = 'forward'   # of `BASELINES`
-    speed: float = 1.0   # [m/s] per axis, opposite in the frames
-    rate: float = 1.0   # [rad/s] likewise
-    pixel_noise: float = 0.5   # [px] 1 sigma per axis
-    gravity_noise: float = 0.2   # [deg] 1 sigma per axis of one frame's direction
-    gyro_noise: float = 0.1   # [deg/s] 1 sigma per axis
-    outliers: float = 0.3   # share of matches whose second point is anywhere
-    constant_velocity: bool = False   # both frames move along the baseline at ``sqrt(3) speed``
+    direction: str = 'forward'  # of `BASELINES`
+    speed: float = 1.0  # [m/s] per axis, opposite in the frames
+    rate: float = 1.0  # [rad/s] likewise
+    pixel_noise: float = 0.5  # [px] 1 sigma per axis
+    gravity_noise: float = 0.2  # [deg] 1 sigma per axis of one frame's direction
+    gyro_noise: float = 0.1  # [deg/s] 1 sigma per axis
+    outliers: float = 0.3  # share of matches whose second point is anywhere
+    constant_velocity: bool = False  # both frames move along the baseline at ``sqrt(3) speed``
     matches: int = 300
     # Points drawn in a box of the world, or over the image 1.
     placing: Literal['box', 'image'] = 'box'
@@ -80,8 +86,11 @@ _VARIATIONS: dict[str, dict[str, float]] = {
     'v0-w0-outliers-60': {'speed': 0.0, 'rate': 0.0, 'outliers': 0.6},
 }
 
-CELLS = {f'{direction}-{name}': Cell(direction=direction, **changes)  # type: ignore[arg-type]
-         for direction in BASELINES for name, changes in _VARIATIONS.items()}
+CELLS = {
+    f'{direction}-{name}': Cell(direction=direction, **changes)  # type: ignore[arg-type]
+    for direction in BASELINES
+    for name, changes in _VARIATIONS.items()
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,22 +99,25 @@ class TwoViewProblem:
 
     points1: Array
     points2: Array
-    measured_rate1: Array   # [rad/s] in its own camera's frame, as all of these
+    measured_rate1: Array  # [rad/s] in its own camera's frame, as all of these
     measured_rate2: Array
-    measured_gravity1: Array   # unit, down
+    measured_gravity1: Array  # unit, down
     measured_gravity2: Array
-    R: Array   # truth: ``X1 = R X2 + t``, ``|t| = 1``
+    R: Array  # truth: ``X1 = R X2 + t``, ``|t| = 1``
     t: Array
-    v1: Array   # true velocities in their own frames [baselines per second]
+    v1: Array  # true velocities in their own frames [baselines per second]
     v2: Array
-    w1: Array   # [rad/s]
+    w1: Array  # [rad/s]
     w2: Array
-    gravity1: Array   # true direction in camera 1
+    gravity1: Array  # true direction in camera 1
     is_outlier: NDArray[np.bool_]
 
 
-def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
-                 ) -> TwoViewProblem:
+def make_problem(
+    cell: Cell,
+    seed: int | Sequence[int],
+    noise: Noise = 'paper',
+) -> TwoViewProblem:
     """Draw one problem of a cell.
 
     `seed`: equal seeds give the same cameras in all cells, and the same points in cells that
@@ -118,8 +130,9 @@ def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
     rng = np.random.default_rng(seed)
     baseline = np.array(BASELINES[cell.direction]) + 0.2 * rng.normal(size=3)
     length = float(np.linalg.norm(baseline))
-    attitude1, attitude2 = Rotation.from_euler('xyz', rng.uniform(-10.0, 10.0, (2, 3)),
-                                               degrees=True)
+    attitude1, attitude2 = Rotation.from_euler(
+        'xyz', rng.uniform(-10.0, 10.0, (2, 3)), degrees=True
+    )
     velocity1 = cell.speed * rng.choice([-1.0, 1.0], 3)
     velocity2 = -velocity1
     if cell.constant_velocity:
@@ -134,9 +147,13 @@ def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
             return in_front(VIEW, attitude1, np.zeros(3), count, _DEPTHS, rng)
         return rng.uniform([-30.0, -18.0, _DEPTHS[0]], [30.0, 18.0, _DEPTHS[1]], (count, 3))
 
-    exact = in_both_views(candidates, uniform_motion(attitude1, np.zeros(3), rate1, velocity1),
-                          uniform_motion(attitude2, baseline, rate2, velocity2), VIEW,
-                          cell.matches)
+    exact = in_both_views(
+        candidates,
+        uniform_motion(attitude1, np.zeros(3), rate1, velocity1),
+        uniform_motion(attitude2, baseline, rate2, velocity2),
+        VIEW,
+        cell.matches,
+    )
     points1, points2, is_outlier = measured(exact, VIEW, cell.pixel_noise, cell.outliers, rng)
     gyro_error1, gyro_error2 = np.radians(cell.gyro_noise) * rng.normal(size=(2, 3))
     if noise == 'paper':
@@ -148,8 +165,18 @@ def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
     down = np.array([0.0, 1.0, 0.0])
     gravity1, gravity2 = attitude1.inv().apply(down), attitude2.inv().apply(down)
     return TwoViewProblem(
-        points1=points1, points2=points2, measured_rate1=rate1 + gyro_error1,
-        measured_rate2=rate2 + gyro_error2, measured_gravity1=tilt1.apply(gravity1),
-        measured_gravity2=tilt2.apply(gravity2), R=(attitude1.inv() * attitude2).as_matrix(),
-        t=attitude1.inv().apply(baseline) / length, v1=velocity1 / length, v2=velocity2 / length,
-        w1=rate1, w2=rate2, gravity1=gravity1, is_outlier=is_outlier)
+        points1=points1,
+        points2=points2,
+        measured_rate1=rate1 + gyro_error1,
+        measured_rate2=rate2 + gyro_error2,
+        measured_gravity1=tilt1.apply(gravity1),
+        measured_gravity2=tilt2.apply(gravity2),
+        R=(attitude1.inv() * attitude2).as_matrix(),
+        t=attitude1.inv().apply(baseline) / length,
+        v1=velocity1 / length,
+        v2=velocity2 / length,
+        w1=rate1,
+        w2=rate2,
+        gravity1=gravity1,
+        is_outlier=is_outlier,
+    )

@@ -38,13 +38,13 @@ class RowMetrics:
 
     name: str
     readout_ms: float
-    keyframes: float   # rms error of positions after rigid alignment [m]
-    first: float   # that of the rows by this alignment
+    keyframes: float  # rms error of positions after rigid alignment [m]
+    first: float  # that of the rows by this alignment
     middle: float
     last: float
-    turned: float   # largest rms error of the rows' rotations within 0.5 s [deg]
-    rendered: float   # gray difference with linear poses of the rows, by that with the middle one
-    rendered_on_path: float   # the same with the alignment of the whole path
+    turned: float  # largest rms error of the rows' rotations within 0.5 s [deg]
+    rendered: float  # gray difference with linear poses of the rows, by that with the middle one
+    rendered_on_path: float  # the same with the alignment of the whole path
 
 
 class _Linear(NamedTuple):
@@ -52,16 +52,18 @@ class _Linear(NamedTuple):
 
     begin: float
     end: float
-    R: Array   # (2, 3, 3)
-    positions: Array   # (2, 3)
+    R: Array  # (2, 3, 3)
+    positions: Array  # (2, 3)
 
     def poses(self, times: Array) -> tuple[Array, Array]:
         """Positions and orientations at times."""
         share = (np.atleast_1d(times) - self.begin) / (self.end - self.begin)
         first = Rotation.from_matrix(self.R[0])
         turn = (first.inv() * Rotation.from_matrix(self.R[1])).as_rotvec()
-        return (self.positions[0] + share[:, None] * (self.positions[1] - self.positions[0]),
-                (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix())
+        return (
+            self.positions[0] + share[:, None] * (self.positions[1] - self.positions[0]),
+            (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix(),
+        )
 
 
 def on_walk(config: SimulationConfig) -> RowMetrics:
@@ -83,17 +85,26 @@ def on_walk(config: SimulationConfig) -> RowMetrics:
     times = [firsts + part for part in (0, span // 2, span)]
     first, middle, last = (_position_error(simulation, rows, at)[0] / error for at in times)
     turned = max(_rotation_error(simulation, rows, at) for at in times)
-    return RowMetrics(recording.source.name, 1e3 * config.readout_time, error, first, middle, last,
-                      turned, *_rendered(simulation, rows, times, A, t))
+    return RowMetrics(
+        recording.source.name,
+        1e3 * config.readout_time,
+        error,
+        first,
+        middle,
+        last,
+        turned,
+        *_rendered(simulation, rows, times, A, t),
+    )
 
 
-def _position_error(simulation: Simulation, rows: RowTrajectory,
-                    times: Times) -> tuple[float, Array, Array]:
+def _position_error(
+    simulation: Simulation, rows: RowTrajectory, times: Times
+) -> tuple[float, Array, Array]:
     """Root mean square [m] after rigid alignment, with its rotation and translation."""
     _, p = rows.pose(times)
     true = simulation.states(times).position
     A, t, _ = aligned(p, true)
-    return float(np.sqrt(((p @ A.T + t - true)**2).sum(axis=1).mean())), A, t
+    return float(np.sqrt(((p @ A.T + t - true) ** 2).sum(axis=1).mean())), A, t
 
 
 def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -> float:
@@ -105,8 +116,9 @@ def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -
     return float(np.degrees(np.sqrt((angles**2).mean())))
 
 
-def _rendered(simulation: Simulation, rows: RowTrajectory, times: Sequence[Times], A: Array,
-              t: Array) -> tuple[float, float]:
+def _rendered(
+    simulation: Simulation, rows: RowTrajectory, times: Sequence[Times], A: Array, t: Array
+) -> tuple[float, float]:
     """Ratios of the gray differences, of frames with enough motion."""
     sums, config = np.zeros((2, 2)), simulation.config
     stamps = np.column_stack(times)
@@ -132,9 +144,35 @@ def _rendered(simulation: Simulation, rows: RowTrajectory, times: Sequence[Times
 
 def write_report(folder: Path, walks: Sequence[RowMetrics]) -> str:
     """Write the metrics (CSV) and the report (Markdown), and return the latter."""
-    return write_table(folder, 'reconstruction', walks, markdown_table(
-        ('walk', 'readout [ms]', 'keyframes [mm]', 'first row by that', 'middle', 'last',
-         'rotation [deg]', 'rendered', 'on the path'),
-        [(one.name, f'{one.readout_ms:.1f}', f'{1e3 * one.keyframes:.1f}', f'{one.first:.2f}',
-          f'{one.middle:.2f}', f'{one.last:.2f}', f'{one.turned:.4f}', f'{one.rendered:.2f}',
-          f'{one.rendered_on_path:.2f}') for one in walks]))
+    return write_table(
+        folder,
+        'reconstruction',
+        walks,
+        markdown_table(
+            (
+                'walk',
+                'readout [ms]',
+                'keyframes [mm]',
+                'first row by that',
+                'middle',
+                'last',
+                'rotation [deg]',
+                'rendered',
+                'on the path',
+            ),
+            [
+                (
+                    one.name,
+                    f'{one.readout_ms:.1f}',
+                    f'{1e3 * one.keyframes:.1f}',
+                    f'{one.first:.2f}',
+                    f'{one.middle:.2f}',
+                    f'{one.last:.2f}',
+                    f'{one.turned:.4f}',
+                    f'{one.rendered:.2f}',
+                    f'{one.rendered_on_path:.2f}',
+                )
+                for one in walks
+            ],
+        ),
+    )

@@ -27,8 +27,13 @@ class PoseError:
 NO_POSE = PoseError(math.inf, math.inf)
 
 
-def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Array | None = None,
-               ) -> PoseError:
+def pose_error(
+    R: Array,
+    t: Array,
+    true_R: Array,
+    true_t: Array,
+    covariance: Array | None = None,
+) -> PoseError:
     """Error of a pose ``X1 = R X2 + t``.
 
     `t` is a unit vector, `true_t` of any length but zero.
@@ -62,7 +67,8 @@ def chi_squares(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Ar
     across = tangent.T @ shift
     return ChiSquares(
         float(across @ np.linalg.solve(tangent.T @ covariance[:3, :3] @ tangent, across)),
-        float(rotation_error @ np.linalg.solve(covariance[3:, 3:], rotation_error)))
+        float(rotation_error @ np.linalg.solve(covariance[3:, 3:], rotation_error)),
+    )
 
 
 def _rotation_and_shift(R: Array, t: Array, true_R: Array, true_t: Array) -> tuple[Array, Array]:

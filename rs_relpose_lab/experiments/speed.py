@@ -24,10 +24,15 @@ LIBRARY = 'rs_relpose_ros'
 REFERENCE = 'PoseLib, derotated points'
 # In the report; PoseLib's only where it is installed.
 COMPARED = {LIBRARY: METHODS['auto']} | {
-    name: replace(METHODS[key], threshold=THRESHOLD) for name, key in (
+    name: replace(METHODS[key], threshold=THRESHOLD)
+    for name, key in (
         ('OpenCV USAC_MAGSAC, raw points', 'opencv'),
         ('OpenCV USAC_MAGSAC, derotated points', 'opencv_derotated'),
-        ('PoseLib, raw points', 'poselib'), (REFERENCE, 'poselib_derotated')) if key in METHODS}
+        ('PoseLib, raw points', 'poselib'),
+        (REFERENCE, 'poselib_derotated'),
+    )
+    if key in METHODS
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +48,13 @@ class Timing:
     translation: float
 
 
-def compare(cell_name: str, matches: int, trials: int, first_seed: int = 0,
-            on_problem: Callable[[], object] = lambda: None) -> list[Timing]:
+def compare(
+    cell_name: str,
+    matches: int,
+    trials: int,
+    first_seed: int = 0,
+    on_problem: Callable[[], object] = lambda: None,
+) -> list[Timing]:
     """Run every method on the same problems of a cell.
 
     The methods alternate on each problem, and the shortest of three repeats counts, so that other
@@ -61,13 +71,15 @@ def compare(cell_name: str, matches: int, trials: int, first_seed: int = 0,
             call = prepared(method, pair, seed)
             duration = 1e3 * min(timeit.repeat(call, number=1, repeat=REPEATS))
             error = pair.error(call())
-            timings.append(Timing(cell_name, matches, name, seed, duration, error.rotation,
-                                  error.translation))
+            timings.append(
+                Timing(cell_name, matches, name, seed, duration, error.rotation, error.translation)
+            )
         on_problem()
     return timings
 
 
 # -- report -----------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True, slots=True)
 class MethodStatistics:
@@ -79,7 +91,7 @@ class MethodStatistics:
     trials: int
     lost: int
     time: Quantiles
-    time_ratio: float   # median of its time by that of PoseLib on derotated points, if installed
+    time_ratio: float  # median of its time by that of PoseLib on derotated points, if installed
     rotation: Quantiles
     translation: Quantiles
 
@@ -89,16 +101,29 @@ def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
     groups = grouped(timings, attrgetter('cell', 'matches', 'method'))
     result = []
     for (cell, matches, method), group in groups.items():
-        reference = {timing.seed: timing.duration
-                     for timing in groups.get((cell, matches, REFERENCE), [])}
-        result.append(MethodStatistics(
-            cell, matches, method, trials=len(group),
-            lost=sum(math.isinf(timing.rotation) for timing in group),
-            time=Quantiles.of(timing.duration for timing in group),
-            time_ratio=float(np.median([timing.duration / reference.get(timing.seed, math.nan)
-                                        for timing in group])),
-            rotation=Quantiles.of(timing.rotation for timing in group),
-            translation=Quantiles.of(timing.translation for timing in group)))
+        reference = {
+            timing.seed: timing.duration for timing in groups.get((cell, matches, REFERENCE), [])
+        }
+        result.append(
+            MethodStatistics(
+                cell,
+                matches,
+                method,
+                trials=len(group),
+                lost=sum(math.isinf(timing.rotation) for timing in group),
+                time=Quantiles.of(timing.duration for timing in group),
+                time_ratio=float(
+                    np.median(
+                        [
+                            timing.duration / reference.get(timing.seed, math.nan)
+                            for timing in group
+                        ]
+                    )
+                ),
+                rotation=Quantiles.of(timing.rotation for timing in group),
+                translation=Quantiles.of(timing.translation for timing in group),
+            )
+        )
     return result
 
 
@@ -116,16 +141,32 @@ def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[T
 def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing]) -> str:
     parts = [
         '# Speed\n',
-        (f'One thread of {_processor()}; {_versions()}. OpenCV and PoseLib with a threshold of '
-         f'{THRESHOLD:g} px and default options; derotating their points is not counted. This '
-         'library in its default configuration, covariance included. Median / 90th percentile.\n')]
+        (
+            f'One thread of {_processor()}; {_versions()}. OpenCV and PoseLib with a threshold of '
+            f'{THRESHOLD:g} px and default options; derotating their points is not counted. This '
+            'library in its default configuration, covariance included. Median / 90th '
+            'percentile.\n'
+        ),
+    ]
     for cell in dict.fromkeys(entry.cell for entry in compared):
         rows = [entry for entry in compared if entry.cell == cell]
         parts.append(f'## {cell}, {rows[0].matches} matches, {rows[0].trials} problems\n')
-        parts.append(markdown_table(
-            ('method', 'time [ms]', 'by PoseLib, derotated', 'R [deg]', 't [deg]', 'lost'),
-            [(entry.method, entry.time.text(2), f'{entry.time_ratio:.2f}', entry.rotation.text(3),
-              entry.translation.text(3), f'{entry.lost}') for entry in rows]))
+        parts.append(
+            markdown_table(
+                ('method', 'time [ms]', 'by PoseLib, derotated', 'R [deg]', 't [deg]', 'lost'),
+                [
+                    (
+                        entry.method,
+                        entry.time.text(2),
+                        f'{entry.time_ratio:.2f}',
+                        entry.rotation.text(3),
+                        entry.translation.text(3),
+                        f'{entry.lost}',
+                    )
+                    for entry in rows
+                ],
+            )
+        )
     if scaling:
         parts.append(_scaling_table(scaling))
     return '\n'.join(parts)
@@ -135,14 +176,19 @@ def _scaling_table(scaling: Sequence[Timing]) -> str:
     """Median times, and the slope of log time over log matches: 1 is linear."""
     sizes, rows = sorted({timing.matches for timing in scaling}), []
     for method, timings in grouped(scaling, attrgetter('method')).items():
-        times = [float(np.median([one.duration for one in timings if one.matches == size]))
-                 for size in sizes]
+        times = [
+            float(np.median([one.duration for one in timings if one.matches == size]))
+            for size in sizes
+        ]
         slope = np.polyfit(np.log(sizes), np.log(times), 1)[0] if len(sizes) > 1 else math.nan
         rows.append((method, *(f'{time:.2f}' for time in times), f'{slope:.2f}'))
-    return '\n'.join([
-        f'## Median time [ms] by the number of matches ({scaling[0].cell})\n',
-        markdown_table(('method', *map(str, sizes), 'exponent'), rows),
-        'An exponent of 1 is linear growth.\n'])
+    return '\n'.join(
+        [
+            f'## Median time [ms] by the number of matches ({scaling[0].cell})\n',
+            markdown_table(('method', *map(str, sizes), 'exponent'), rows),
+            'An exponent of 1 is linear growth.\n',
+        ]
+    )
 
 
 def _processor() -> str:
@@ -158,5 +204,7 @@ def _versions() -> str:
         poselib = f'PoseLib {version("poselib")}'
     except PackageNotFoundError:
         poselib = 'PoseLib is not installed'
-    return (f'Python {platform.python_version()}, NumPy {np.__version__}, '
-            f'Numba {version("numba")}, OpenCV {cv2.__version__}, {poselib}')
+    return (
+        f'Python {platform.python_version()}, NumPy {np.__version__}, '
+        f'Numba {version("numba")}, OpenCV {cv2.__version__}, {poselib}'
+    )

@@ -32,37 +32,61 @@ class Wrong(NamedTuple):
     """A wrong value: the error of a quantity, in its unit, by that of `quantity` in `findings`."""
 
     quantity: str
-    error: Callable[[float], float]   # by the right value
+    error: Callable[[float], float]  # by the right value
     values: Callable[[Parameters], Mapping[str, Any]]
 
 
 def _offset(milliseconds: float) -> Wrong:
-    return Wrong('time_offset', lambda right: 1e-3 * milliseconds, lambda parameters: {
-        'time_offset': parameters.sensor.time_offset + 1e-3 * milliseconds})
+    return Wrong(
+        'time_offset',
+        lambda right: 1e-3 * milliseconds,
+        lambda parameters: {'time_offset': parameters.sensor.time_offset + 1e-3 * milliseconds},
+    )
 
 
 def _readout(factor: float) -> Wrong:
-    return Wrong('readout_time', lambda right: (factor - 1.0) * right, lambda parameters: {
-        'readout_time': factor * (parameters.sensor.readout_time or 0.0)})
+    return Wrong(
+        'readout_time',
+        lambda right: (factor - 1.0) * right,
+        lambda parameters: {'readout_time': factor * (parameters.sensor.readout_time or 0.0)},
+    )
 
 
 def _axes(degrees: float) -> Wrong:
-    return Wrong('axes', lambda right: degrees, lambda parameters: {'quat_cam_imu_xyzw': tuple((
-        Rotation.from_rotvec(math.radians(degrees) * _AXIS)
-        * Rotation.from_quat(parameters.sensor.quat_cam_imu_xyzw)).as_quat())})
+    return Wrong(
+        'axes',
+        lambda right: degrees,
+        lambda parameters: {
+            'quat_cam_imu_xyzw': tuple(
+                (
+                    Rotation.from_rotvec(math.radians(degrees) * _AXIS)
+                    * Rotation.from_quat(parameters.sensor.quat_cam_imu_xyzw)
+                ).as_quat()
+            )
+        },
+    )
 
 
 def _focal(factor: float) -> Wrong:
     scale = np.array([factor, 1.0, 1.0, 1.0, factor, 1.0, 1.0, 1.0, 1.0])
-    return Wrong('focal_length', lambda right: (factor - 1.0) * right, lambda parameters: {
-        'camera_matrix': tuple(scale * parameters.intrinsics.camera_matrix)})
+    return Wrong(
+        'focal_length',
+        lambda right: (factor - 1.0) * right,
+        lambda parameters: {'camera_matrix': tuple(scale * parameters.intrinsics.camera_matrix)},
+    )
 
 
 ROWS: Mapping[str, Wrong] = {
-    'offset +10 ms': _offset(10.0), 'offset -10 ms': _offset(-10.0),
-    'offset +30 ms': _offset(30.0), 'offset -30 ms': _offset(-30.0),
-    'readout x0.5': _readout(0.5), 'readout x2': _readout(2.0), 'axes 3 deg': _axes(3.0),
-    'focal x0.95': _focal(0.95), 'focal x1.05': _focal(1.05)}
+    'offset +10 ms': _offset(10.0),
+    'offset -10 ms': _offset(-10.0),
+    'offset +30 ms': _offset(30.0),
+    'offset -30 ms': _offset(-30.0),
+    'readout x0.5': _readout(0.5),
+    'readout x2': _readout(2.0),
+    'axes 3 deg': _axes(3.0),
+    'focal x0.95': _focal(0.95),
+    'focal x1.05': _focal(1.05),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +95,11 @@ class Suggestion:
 
     bag: str
     row: str
-    size: float   # its error in sigmas of the right run; 0 where that does not observe it
+    size: float  # its error in sigmas of the right run; 0 where that does not observe it
     right: float
-    estimated: float = math.nan   # by the last finding; NaN without one
-    sigma: float = math.nan   # likewise
-    others: str = ''   # parameters named, too
+    estimated: float = math.nan  # by the last finding; NaN without one
+    sigma: float = math.nan  # likewise
+    others: str = ''  # parameters named, too
 
     @property
     def off(self) -> float:
@@ -93,12 +117,18 @@ def on_recording(path: Path, parameter_file: Path) -> list[Suggestion]:
         named, _ = _findings(path, parameters.updated(wrong.values(parameters)))
         reference, last = correct.get(wrong.quantity), named.pop(wrong.quantity, None)
         # An angle has the error itself as its estimate.
-        right = {'axes': wrong.error(0.0), 'focal_length': parameters.intrinsics.camera_matrix[0],
-                 'time_offset': parameters.sensor.time_offset,
-                 'readout_time': parameters.sensor.readout_time or 0.0}[wrong.quantity]
+        right = {
+            'axes': wrong.error(0.0),
+            'focal_length': parameters.intrinsics.camera_matrix[0],
+            'time_offset': parameters.sensor.time_offset,
+            'readout_time': parameters.sensor.readout_time or 0.0,
+        }[wrong.quantity]
         size = abs(wrong.error(right)) / reference.sigma if reference and reference.sigma else 0.0
-        estimated, sigma = (math.nan, math.nan) if last is None else (
-            last.estimated or 0.0, last.sigma or math.nan)
+        estimated, sigma = (
+            (math.nan, math.nan)
+            if last is None
+            else (last.estimated or 0.0, last.sigma or math.nan)
+        )
         results.append(Suggestion(path.name, name, size, right, estimated, sigma, ' '.join(named)))
     return results
 
@@ -111,9 +141,13 @@ def _with_lens(path: Path, parameters: Parameters) -> Parameters:
         topics = bag.find_topics()
         message = next(message for _, message in sensor_messages(bag, topics, (Role.CAMERA_INFO,)))
         lens = PARTS[Role.CAMERA_INFO].read(message.message)
-    return parameters.updated({
-        'camera_matrix': (lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0),
-        'distortion_model': lens.distortion_model, 'distortion_coefficients': lens.distortion})
+    return parameters.updated(
+        {
+            'camera_matrix': (lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0),
+            'distortion_model': lens.distortion_model,
+            'distortion_coefficients': lens.distortion,
+        }
+    )
 
 
 def _findings(path: Path, parameters: Parameters) -> tuple[dict[str, Finding], dict[str, Finding]]:
@@ -123,8 +157,11 @@ def _findings(path: Path, parameters: Parameters) -> tuple[dict[str, Finding], d
         run = Replay(bag, bag.find_topics(needs_camera_info=False), parameters)
         for assessment in (*(pair.health for pair in run.pairs()), run.health):
             named.update({finding.quantity: finding for finding in assessment.faults})
-    return named, {finding.quantity: finding for finding in run.health.findings
-                   if finding.quantity not in named}
+    return named, {
+        finding.quantity: finding
+        for finding in run.health.findings
+        if finding.quantity not in named
+    }
 
 
 def write_report(folder: Path, results: Sequence[Suggestion]) -> str:
@@ -135,15 +172,25 @@ def write_report(folder: Path, results: Sequence[Suggestion]) -> str:
     named = [one for one in large if not math.isnan(one.estimated)]
     right = sum(abs(one.off) < RIGHT for one in named)
     alarms = sum(one.row == 'right' and bool(one.others) for one in results)
-    table = markdown_table(('row', *bags), [(row, *(cells.get((bag, row), '') for bag in bags))
-                                            for row in ('right', *ROWS)])
-    return write_table(folder, 'suggestions', results, (
-        f'{table}\n{len(named)} of {len(large)} errors of over {LARGE:g} sigmas named, {right} of '
-        f'their values within {RIGHT:g} sigmas; {alarms} right runs with a finding\n'))
+    table = markdown_table(
+        ('row', *bags),
+        [(row, *(cells.get((bag, row), '') for bag in bags)) for row in ('right', *ROWS)],
+    )
+    return write_table(
+        folder,
+        'suggestions',
+        results,
+        (
+            f'{table}\n{len(named)} of {len(large)} errors of over {LARGE:g} sigmas named, '
+            f'{right} of '
+            f'their values within {RIGHT:g} sigmas; {alarms} right runs with a finding\n'
+        ),
+    )
 
 
 def _cell(one: Suggestion) -> str:
     """Error of the estimate in its sigmas, and the size of the error in brackets."""
     text = '-' if math.isnan(one.estimated) else f'{one.off:+.1f}'
     return (f'{text} ({one.size:.0f})' if one.row != 'right' else 'ok' * (not one.others)) + (
-        f' also {one.others}' if one.others else '')
+        f' also {one.others}' if one.others else ''
+    )

@@ -42,8 +42,8 @@ class BagPlan(NamedTuple):
     seed: int
     seconds: float
     readout_time: float
-    noise: float = 0.0   # by the configured one; 0 for a usual camera and IMU
-    images: bool = False   # rendered, rather than tracks alone
+    noise: float = 0.0  # by the configured one; 0 for a usual camera and IMU
+    images: bool = False  # rendered, rather than tracks alone
 
     @property
     def motion(self) -> str:
@@ -56,14 +56,29 @@ class BagPlan(NamedTuple):
         return SCENES[self.number // len(MOTIONS) % len(SCENES)]
 
 
-def plans(bags: int, seconds: float, first_seed: int, *, noises: Sequence[float] = (0.0,),
-          images: bool = False) -> list[BagPlan]:
+def plans(
+    bags: int,
+    seconds: float,
+    first_seed: int,
+    *,
+    noises: Sequence[float] = (0.0,),
+    images: bool = False,
+) -> list[BagPlan]:
     """Bags whose readouts are spread from 12 to 35 ms; noises alternate."""
     readouts = np.linspace(0.012, 0.035, max(bags, 2))[:bags]
     # Neighbours in motion and scene get readouts from all over.
     order = np.random.default_rng(first_seed).permutation(bags)
-    return [BagPlan(k, first_seed + k, seconds, round(float(readouts[order[k]]), 4),
-                    noises[k // len(MOTIONS) % len(noises)], images) for k in range(bags)]
+    return [
+        BagPlan(
+            k,
+            first_seed + k,
+            seconds,
+            round(float(readouts[order[k]]), 4),
+            noises[k // len(MOTIONS) % len(noises)],
+            images,
+        )
+        for k in range(bags)
+    ]
 
 
 def simulation_of(plan: BagPlan) -> Simulation:
@@ -74,22 +89,34 @@ def simulation_of(plan: BagPlan) -> Simulation:
     mounting = tilt * Rotation.from_quat(default.quat_cam_imu_xyzw)
     imu = ImuConfig()
     config = SimulationConfig(
-        duration=plan.seconds, seed=plan.seed, scene=plan.scene,
+        duration=plan.seconds,
+        seed=plan.seed,
+        scene=plan.scene,
         # A sensor cannot be read for longer than a frame takes.
-        fps=min(30.0, 0.98 / plan.readout_time), readout_time=plan.readout_time,
+        fps=min(30.0, 0.98 / plan.readout_time),
+        readout_time=plan.readout_time,
         fx=float(rng.uniform(380.0, 540.0)),
         distortion=tuple(float(rng.uniform(0.6, 1.3)) * k for k in default.distortion),
         time_offset=float(rng.uniform(-0.04, 0.04)),
         quat_cam_imu_xyzw=tuple(float(v) for v in mounting.as_quat()),
         gyro_bias=tuple(float(v) for v in rng.uniform(-0.02, 0.02, 3)),
-        gyro_noise_density=(plan.noise * imu.gyro_noise_density if plan.noise
-                            else default.gyro_noise_density))
+        gyro_noise_density=(
+            plan.noise * imu.gyro_noise_density if plan.noise else default.gyro_noise_density
+        ),
+    )
     trajectory = None
     if plan.motion == 'vehicle':
-        trajectory = vehicle(np.random.default_rng([plan.seed, _MOTION]), -0.5,
-                             plan.seconds + 0.5, speed=float(rng.uniform(0.8, 1.6)))
-    scene = None if plan.images else make_scene(
-        plan.scene, np.random.default_rng([plan.seed, _SCENE]), _NO_TEXTURE)
+        trajectory = vehicle(
+            np.random.default_rng([plan.seed, _MOTION]),
+            -0.5,
+            plan.seconds + 0.5,
+            speed=float(rng.uniform(0.8, 1.6)),
+        )
+    scene = (
+        None
+        if plan.images
+        else make_scene(plan.scene, np.random.default_rng([plan.seed, _SCENE]), _NO_TEXTURE)
+    )
     return simulate(config, scene=scene, trajectory=trajectory)
 
 
@@ -99,12 +126,15 @@ def recording_of(plan: BagPlan) -> trust_runs.Recording:
     if noise is not None and plan.noise:
         # Configured is the noise of either image's points; here only the second ones have any.
         noise = trust_runs.TrackNoise(
-            white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma)
+            white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma
+        )
     kind = trust_runs.IMAGES if plan.images else trust_runs.TRACKS
-    source = trust_runs.Source(f'{plan.seed}', kind, plan.motion, plan.scene, plan.seed,
-                               plan.noise)
-    return trust_runs.simulated(source, simulation_of(plan), noise,
-                                np.random.default_rng([plan.seed, _TRACKS]))
+    source = trust_runs.Source(
+        f'{plan.seed}', kind, plan.motion, plan.scene, plan.seed, plan.noise
+    )
+    return trust_runs.simulated(
+        source, simulation_of(plan), noise, np.random.default_rng([plan.seed, _TRACKS])
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,40 +151,51 @@ class BagRow:
     readout_ms: float
     noise: float
     row: str
-    informative: float   # informative seconds of motion
-    qualifies: bool   # whether they are enough
-    flagged: bool   # within them
-    flagged_after: float   # after so many of them; NaN where never
-    named: str   # parameters named at the end of that time
-    named_right: bool   # at most two, with a right one among them
+    informative: float  # informative seconds of motion
+    qualifies: bool  # whether they are enough
+    flagged: bool  # within them
+    flagged_after: float  # after so many of them; NaN where never
+    named: str  # parameters named at the end of that time
+    named_right: bool  # at most two, with a right one among them
     pairs: int
-    poses: int   # published, at level ok or unknown, after the first of these seconds
-    direction_beyond: int   # those of them with an error beyond the limit
+    poses: int  # published, at level ok or unknown, after the first of these seconds
+    direction_beyond: int  # those of them with an error beyond the limit
     rotation_beyond: int
-    all_poses: int   # from the start, as the next two
+    all_poses: int  # from the start, as the next two
     all_direction_beyond: int
     all_rotation_beyond: int
-    nees_direction: float   # mean of the chi squares by their degrees of freedom
+    nees_direction: float  # mean of the chi squares by their degrees of freedom
     nees_rotation: float
-    direction_error: float   # median [deg], as the next two
+    direction_error: float  # median [deg], as the next two
     direction_sigma: float
     rotation_error: float
-    frame_ms: float   # median, frames with a pair
+    frame_ms: float  # median, frames with a pair
 
 
 # A bag to simulate, or the path of a recording, and its rows.
 Task = tuple[BagPlan | Path, Sequence[str]]
 
 
-def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, right: int = 0,
-          rendered: int = 0, recordings: Sequence[Path] = ()) -> list[Task]:
+def tasks(
+    rows: Sequence[str],
+    bags: int,
+    seconds: float,
+    first_seed: int,
+    *,
+    right: int = 0,
+    rendered: int = 0,
+    recordings: Sequence[Path] = (),
+) -> list[Task]:
     """Bags and recordings to measure; arguments as the options of the command."""
     # The same readouts, however many of them are rendered.
     with_images = plans(max(bags, rendered), seconds, first_seed, images=True)[:rendered]
     # Seeds of their own.
     for_alarms = plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))
-    with_rows: list[BagPlan | Path] = [*plans(bags, seconds, first_seed), *with_images,
-                                       *recordings]
+    with_rows: list[BagPlan | Path] = [
+        *plans(bags, seconds, first_seed),
+        *with_images,
+        *recordings,
+    ]
     return [*((bag, rows) for bag in with_rows), *((plan, (RIGHT,)) for plan in for_alarms)]
 
 
@@ -175,45 +216,74 @@ def measure(task: Task) -> list[BagRow]:
         configured = row.wrong(recording.configured, np.random.default_rng(drawn))
         injected = row.injected(recording.configured, np.random.default_rng(drawn))
         if injected is not None and not injected.error.any():
-            continue   # e.g. no distortion to leave out
+            continue  # e.g. no distortion to leave out
         informative = motion.seconds(injected)
         # A run may end some seconds after all those that count.
         passed = np.flatnonzero(np.cumsum(informative) >= row.within)
         end = float(passed[0]) + 1.0 + _AFTERWARDS if len(passed) else math.inf
         results = right if name == RIGHT else trust_runs.run(recording, configured, end)
-        found.append(bag_row(recording, name, informative,
-                             [trust_runs.evaluated(recording, *result) for result in results]))
+        found.append(
+            bag_row(
+                recording,
+                name,
+                informative,
+                [trust_runs.evaluated(recording, *result) for result in results],
+            )
+        )
     return found
 
 
-def bag_row(recording: trust_runs.Recording, name: str, informative: NDArray[np.bool_],
-            pairs: Sequence[trust_runs.EvaluatedPair]) -> BagRow:
+def bag_row(
+    recording: trust_runs.Recording,
+    name: str,
+    informative: NDArray[np.bool_],
+    pairs: Sequence[trust_runs.EvaluatedPair],
+) -> BagRow:
     """Result of a row; `informative`: which seconds of the recording are, for its error."""
     row, source = ROWS[name], recording.source
     clocks = [_clock(informative, pair.at) for pair in pairs]
-    flags = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
-             if pair.state in trust_runs.FLAGGED]
+    flags = [
+        (clock, pair)
+        for clock, pair in zip(clocks, pairs, strict=True)
+        if pair.state in trust_runs.FLAGGED
+    ]
     in_time = [pair for clock, pair in flags if clock <= row.within]
     # Its last report within the time.
     named = in_time[-1].named if in_time else ()
-    published = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
-                 if pair.has_pose and pair.state not in trust_runs.FLAGGED]
+    published = [
+        (clock, pair)
+        for clock, pair in zip(clocks, pairs, strict=True)
+        if pair.has_pose and pair.state not in trust_runs.FLAGGED
+    ]
     every, later = [p for _, p in published], [p for clock, p in published if clock > 1.0]
     counted = later if name != RIGHT else every
     seconds = _clock(informative, recording.seconds)
     return BagRow(
-        bag=source.name, kind=source.kind, motion=source.motion, scene=source.scene,
-        readout_ms=1e3 * recording.camera.readout_time, noise=source.noise, row=name,
-        informative=seconds, qualifies=seconds >= row.within, flagged=bool(in_time),
-        flagged_after=flags[0][0] if flags else math.nan, named=' '.join(named),
-        named_right=len(named) <= 2 and bool(set(named) & set(row.named)), pairs=len(pairs),
-        poses=len(later), all_poses=len(every), **_beyond(later), **_beyond(every, 'all_'),
+        bag=source.name,
+        kind=source.kind,
+        motion=source.motion,
+        scene=source.scene,
+        readout_ms=1e3 * recording.camera.readout_time,
+        noise=source.noise,
+        row=name,
+        informative=seconds,
+        qualifies=seconds >= row.within,
+        flagged=bool(in_time),
+        flagged_after=flags[0][0] if flags else math.nan,
+        named=' '.join(named),
+        named_right=len(named) <= 2 and bool(set(named) & set(row.named)),
+        pairs=len(pairs),
+        poses=len(later),
+        all_poses=len(every),
+        **_beyond(later),
+        **_beyond(every, 'all_'),
         nees_direction=_mean([p.chi_direction / 2 for p in counted]),
         nees_rotation=_mean([p.chi_rotation / 3 for p in counted]),
         direction_error=_median([p.direction_error for p in counted]),
         direction_sigma=_median([p.direction_sigma for p in counted]),
         rotation_error=_median([p.rotation_error for p in counted]),
-        frame_ms=1e3 * _median([p.seconds for p in pairs]))
+        frame_ms=1e3 * _median([p.seconds for p in pairs]),
+    )
 
 
 def _clock(informative: NDArray[np.bool_], at: float) -> float:
@@ -224,8 +294,10 @@ def _clock(informative: NDArray[np.bool_], at: float) -> float:
 
 
 def _beyond(pairs: Sequence[trust_runs.EvaluatedPair], prefix: str = '') -> dict[str, int]:
-    return {f'{prefix}direction_beyond': sum(p.chi_direction > LIMIT_T for p in pairs),
-            f'{prefix}rotation_beyond': sum(p.chi_rotation > LIMIT_R for p in pairs)}
+    return {
+        f'{prefix}direction_beyond': sum(p.chi_direction > LIMIT_T for p in pairs),
+        f'{prefix}rotation_beyond': sum(p.chi_rotation > LIMIT_R for p in pairs),
+    }
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -240,22 +312,41 @@ def _median(values: Sequence[float]) -> float:
 
 # Columns of the tables: title, name of the value, digits.
 _ROW_COLUMNS = (
-    ('bags', 'bags', 0), ('qualify', 'qualify', 0), ('within [s]', 'within', 0),
-    ('flagged', 'flagged', 0), ('named right', 'named', 0), ('after [s]', 'after', 1),
-    ('poses', 'poses', 0), ('t beyond', 'direction_beyond', 1),
-    ('R beyond', 'rotation_beyond', 1), ('all poses', 'all_poses', 0),
-    ('t beyond', 'all_direction_beyond', 1), ('R beyond', 'all_rotation_beyond', 1),
-    ('t error [deg]', 'direction_error', 2), ('claimed', 'direction_sigma', 2))
+    ('bags', 'bags', 0),
+    ('qualify', 'qualify', 0),
+    ('within [s]', 'within', 0),
+    ('flagged', 'flagged', 0),
+    ('named right', 'named', 0),
+    ('after [s]', 'after', 1),
+    ('poses', 'poses', 0),
+    ('t beyond', 'direction_beyond', 1),
+    ('R beyond', 'rotation_beyond', 1),
+    ('all poses', 'all_poses', 0),
+    ('t beyond', 'all_direction_beyond', 1),
+    ('R beyond', 'all_rotation_beyond', 1),
+    ('t error [deg]', 'direction_error', 2),
+    ('claimed', 'direction_sigma', 2),
+)
 _RIGHT_COLUMNS = (
-    ('bags', 'bags', 0), ('alarms', 'alarms', 0), ('pairs', 'pairs', 0), ('poses', 'poses', 0),
-    ('NEES t', 'nees_direction', 2), ('least', 'nees_direction_least', 2),
-    ('largest', 'nees_direction_largest', 2), ('NEES R', 'nees_rotation', 2),
-    ('least', 'nees_rotation_least', 2), ('largest', 'nees_rotation_largest', 2),
-    ('t error [deg]', 'direction_error', 2), ('R error [deg]', 'rotation_error', 3),
-    ('frame with pair [ms]', 'frame_ms', 1))
-_TITLES = {trust_runs.TRACKS: 'Simulated, without images',
-           trust_runs.IMAGES: 'Simulated, with images',
-           trust_runs.RECORDING: 'Recordings with truth'}
+    ('bags', 'bags', 0),
+    ('alarms', 'alarms', 0),
+    ('pairs', 'pairs', 0),
+    ('poses', 'poses', 0),
+    ('NEES t', 'nees_direction', 2),
+    ('least', 'nees_direction_least', 2),
+    ('largest', 'nees_direction_largest', 2),
+    ('NEES R', 'nees_rotation', 2),
+    ('least', 'nees_rotation_least', 2),
+    ('largest', 'nees_rotation_largest', 2),
+    ('t error [deg]', 'direction_error', 2),
+    ('R error [deg]', 'rotation_error', 3),
+    ('frame with pair [ms]', 'frame_ms', 1),
+)
+_TITLES = {
+    trust_runs.TRACKS: 'Simulated, without images',
+    trust_runs.IMAGES: 'Simulated, with images',
+    trust_runs.RECORDING: 'Recordings with truth',
+}
 
 
 def summary(name: str, bags: Sequence[BagRow]) -> dict[str, Any]:
@@ -267,18 +358,31 @@ def summary(name: str, bags: Sequence[BagRow]) -> dict[str, Any]:
     """
     fit = [bag for bag in bags if bag.qualifies]
     poses, all_poses = (sum(getattr(bag, of) for bag in bags) for of in ('poses', 'all_poses'))
-    beyond = {of: _share(sum(getattr(bag, of) for bag in bags),
-                         all_poses if of.startswith('all') else poses)
-              for of in ('direction_beyond', 'rotation_beyond', 'all_direction_beyond',
-                         'all_rotation_beyond')}
+    beyond = {
+        of: _share(
+            sum(getattr(bag, of) for bag in bags), all_poses if of.startswith('all') else poses
+        )
+        for of in (
+            'direction_beyond',
+            'rotation_beyond',
+            'all_direction_beyond',
+            'all_rotation_beyond',
+        )
+    }
     return {
-        'row': name, 'within': ROWS[bags[0].row].within, 'bags': len(bags),
+        'row': name,
+        'within': ROWS[bags[0].row].within,
+        'bags': len(bags),
         'qualify': _share(len(fit), len(bags)),
         'flagged': _share(sum(bag.flagged for bag in fit), len(fit)),
         'named': _share(sum(bag.named_right for bag in fit), len(fit)),
-        'after': _finite_median(fit, 'flagged_after'), 'poses': poses, 'all_poses': all_poses,
+        'after': _finite_median(fit, 'flagged_after'),
+        'poses': poses,
+        'all_poses': all_poses,
         'direction_error': _finite_median(bags, 'direction_error'),
-        'direction_sigma': _finite_median(bags, 'direction_sigma'), **beyond}
+        'direction_sigma': _finite_median(bags, 'direction_sigma'),
+        **beyond,
+    }
 
 
 def right_summary(kind: str, bags: Sequence[BagRow]) -> dict[str, Any]:
@@ -290,14 +394,23 @@ def right_summary(kind: str, bags: Sequence[BagRow]) -> dict[str, Any]:
     for name in ('nees_direction', 'nees_rotation'):
         known = [(getattr(bag, name), bag.all_poses) for bag in bags if bag.all_poses]
         means, counts = zip(*known, strict=True) if known else ((math.nan,), (1,))
-        nees |= {name: float(np.average(means, weights=counts)), f'{name}_least': min(means),
-                 f'{name}_largest': max(means)}
+        nees |= {
+            name: float(np.average(means, weights=counts)),
+            f'{name}_least': min(means),
+            f'{name}_largest': max(means),
+        }
     return {
-        'kind': kind, 'bags': len(bags), **nees,
+        'kind': kind,
+        'bags': len(bags),
+        **nees,
         'alarms': sum(not math.isnan(bag.flagged_after) for bag in bags),
-        'pairs': sum(bag.pairs for bag in bags), 'poses': sum(bag.all_poses for bag in bags),
-        **{name: _finite_median(bags, name)
-           for name in ('direction_error', 'rotation_error', 'frame_ms')}}
+        'pairs': sum(bag.pairs for bag in bags),
+        'poses': sum(bag.all_poses for bag in bags),
+        **{
+            name: _finite_median(bags, name)
+            for name in ('direction_error', 'rotation_error', 'frame_ms')
+        },
+    }
 
 
 def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
@@ -307,20 +420,26 @@ def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     # A recording without truth has no poses that can be evaluated.
     with_truth = {bag.bag for bag in bags if bag.kind != trust_runs.RECORDING or bag.all_poses}
     for kind, title in _TITLES.items():
-        of_kind = [bag for bag in bags if bag.kind == kind and bag.bag in with_truth
-                   and not bag.noise]
-        rows = [summary(name, of_row)
-                for name, of_row in grouped(of_kind, lambda bag: bag.row).items()]
+        of_kind = [
+            bag for bag in bags if bag.kind == kind and bag.bag in with_truth and not bag.noise
+        ]
+        rows = [
+            summary(name, of_row) for name, of_row in grouped(of_kind, lambda bag: bag.row).items()
+        ]
         if len(rows) > 1:
             rows.append(summary('all rows', of_kind))
         if rows:
             parts.append(f'{title} (shares in per cent):\n\n{_table("row", rows, _ROW_COLUMNS)}')
     recorded = [bag for bag in bags if bag.kind == trust_runs.RECORDING]
     if recorded:
-        parts.append('Recordings (informative seconds until flagged, of how many; named '
-                     f'parameters):\n\n{_recordings_table(recorded)}')
-    right = [right_summary(kind, of_kind) for kind, of_kind in grouped(
-        [bag for bag in bags if bag.row == RIGHT], _kind).items()]
+        parts.append(
+            'Recordings (informative seconds until flagged, of how many; named '
+            f'parameters):\n\n{_recordings_table(recorded)}'
+        )
+    right = [
+        right_summary(kind, of_kind)
+        for kind, of_kind in grouped([bag for bag in bags if bag.row == RIGHT], _kind).items()
+    ]
     if right:
         parts.append(f'Right configuration:\n\n{_table("kind", right, _RIGHT_COLUMNS)}')
     text = '\n'.join(parts)
@@ -328,21 +447,29 @@ def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     return text
 
 
-def _table(key: str, rows: Sequence[dict[str, Any]],
-           columns: Sequence[tuple[str, str, int]]) -> str:
+def _table(
+    key: str, rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str, int]]
+) -> str:
     return markdown_table(
         [key, *(title for title, _, _ in columns)],
-        [[row[key], *(_text(row[name], digits) for _, name, digits in columns)] for row in rows])
+        [[row[key], *(_text(row[name], digits) for _, name, digits in columns)] for row in rows],
+    )
 
 
 def _recordings_table(bags: Sequence[BagRow]) -> str:
     names = tuple(grouped(bags, lambda bag: bag.bag))
-    cells = {(bag.row, bag.bag): f'{_text(bag.flagged_after, 1) or "-"} / {bag.informative:.1f} '
-                                 f'{bag.named}'.rstrip() for bag in bags}
+    cells = {
+        (bag.row, bag.bag): f'{_text(bag.flagged_after, 1) or "-"} / {bag.informative:.1f} '
+        f'{bag.named}'.rstrip()
+        for bag in bags
+    }
     return markdown_table(
         ['row', *names],
-        [[row, *(cells.get((row, name), '') for name in names)]
-         for row in grouped(bags, lambda bag: bag.row)])
+        [
+            [row, *(cells.get((row, name), '') for name in names)]
+            for row in grouped(bags, lambda bag: bag.row)
+        ],
+    )
 
 
 def _kind(bag: BagRow) -> str:

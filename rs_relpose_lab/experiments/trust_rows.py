@@ -24,8 +24,15 @@ Gray = NDArray[np.uint8]
 # Informative seconds of motion within which an error must be flagged.
 GROSS, SMALL = 5, 15
 # Quantities of the laboratory's information, and their number of unknowns.
-QUANTITIES: Mapping[str, int] = {'axes': 3, 'time_offset': 1, 'readout_time': 1, 'gyro_bias': 3,
-                                 'gyro_scale': 1, 'focal_length': 1, 'distortion': 1}
+QUANTITIES: Mapping[str, int] = {
+    'axes': 3,
+    'time_offset': 1,
+    'readout_time': 1,
+    'gyro_bias': 3,
+    'gyro_scale': 1,
+    'focal_length': 1,
+    'distortion': 1,
+}
 
 
 class Geometry(NamedTuple):
@@ -42,11 +49,11 @@ AS_IT_IS = Geometry(lambda points, camera: points, lambda image, camera: image)
 class Configured:
     """Configuration and messages of a run."""
 
-    values: Mapping[str, Any]   # parameters by name
+    values: Mapping[str, Any]  # parameters by name
     intrinsics: Intrinsics
     # An IMU sample as received.
     sample: Callable[[ImuSample], ImuSample] = field(default=lambda sample: sample)
-    geometry: Geometry = AS_IT_IS   # of the images
+    geometry: Geometry = AS_IT_IS  # of the images
 
     @property
     def R_cam_imu(self) -> Rotation:
@@ -78,14 +85,15 @@ Error = Callable[[Configured, np.random.Generator], Injected | None]
 class Row:
     """A row of the matrix."""
 
-    named: tuple[str, ...]   # the right parameters, any of them
-    within: int   # informative seconds of motion
-    wrong: Change   # the wrong configuration in place of the right one
+    named: tuple[str, ...]  # the right parameters, any of them
+    within: int  # informative seconds of motion
+    wrong: Change  # the wrong configuration in place of the right one
     # Its error; None where rotation about two axes is the information.
     injected: Error = lambda right, rng: None
 
 
 # -- errors of the configuration --------------------------------------------------------------
+
 
 def _error(quantity: str, value: float) -> Error:
     return lambda right, rng: Injected(quantity, np.array([value]))
@@ -93,8 +101,9 @@ def _error(quantity: str, value: float) -> Error:
 
 def _axes_rotated(rotation: Callable[[np.random.Generator], Rotation]) -> Change:
     """The IMU's own axes are rotated: ``R_wrong = R_cam_imu T``."""
-    return lambda right, rng: right.with_values(quat_cam_imu_xyzw=tuple(
-        float(v) for v in (right.R_cam_imu * rotation(rng)).as_quat()))
+    return lambda right, rng: right.with_values(
+        quat_cam_imu_xyzw=tuple(float(v) for v in (right.R_cam_imu * rotation(rng)).as_quat())
+    )
 
 
 def _random_vector(rng: np.random.Generator, length: float) -> Array:
@@ -107,15 +116,21 @@ def _three_degrees(rng: np.random.Generator) -> Rotation:
 
 
 def _focal_length(factor: float) -> Change:
-    return lambda right, rng: replace(right, intrinsics=replace(
-        right.intrinsics, fx=factor * right.intrinsics.fx, fy=factor * right.intrinsics.fy))
+    return lambda right, rng: replace(
+        right,
+        intrinsics=replace(
+            right.intrinsics, fx=factor * right.intrinsics.fx, fy=factor * right.intrinsics.fy
+        ),
+    )
 
 
 def _readout(factor: float) -> tuple[Change, Error]:
-    return (lambda right, rng: right.with_values(
-                readout_time=factor * right.values['readout_time']),
-            lambda right, rng: Injected(
-                'readout_time', np.array([(factor - 1.0) * right.values['readout_time']])))
+    return (
+        lambda right, rng: right.with_values(readout_time=factor * right.values['readout_time']),
+        lambda right, rng: Injected(
+            'readout_time', np.array([(factor - 1.0) * right.values['readout_time']])
+        ),
+    )
 
 
 def _reversed(right: Configured, rng: np.random.Generator) -> Configured:
@@ -129,8 +144,10 @@ def _biased(right: Configured, rng: np.random.Generator) -> Configured:
 
 
 def _without_distortion(right: Configured, rng: np.random.Generator) -> Configured:
-    return replace(right, intrinsics=replace(
-        right.intrinsics, distortion=(0.0,) * len(right.intrinsics.distortion)))
+    return replace(
+        right,
+        intrinsics=replace(right.intrinsics, distortion=(0.0,) * len(right.intrinsics.distortion)),
+    )
 
 
 def _distortion_error(right: Configured, rng: np.random.Generator) -> Injected:
@@ -140,6 +157,7 @@ def _distortion_error(right: Configured, rng: np.random.Generator) -> Injected:
 
 # -- errors of the messages -------------------------------------------------------------------
 
+
 def _received(sample: Callable[[ImuSample], ImuSample]) -> Change:
     return lambda right, rng: replace(right, sample=sample)
 
@@ -147,17 +165,21 @@ def _received(sample: Callable[[ImuSample], ImuSample]) -> Change:
 def _gyro_times(factor: float) -> Change:
     def scaled(rate: Vector | None) -> Vector | None:
         return None if rate is None else (factor * rate[0], factor * rate[1], factor * rate[2])
-    return _received(lambda sample: replace(
-        sample, angular_velocity=scaled(sample.angular_velocity)))
+
+    return _received(
+        lambda sample: replace(sample, angular_velocity=scaled(sample.angular_velocity))
+    )
 
 
 def _accel(rotation: Rotation, sign: float) -> Change:
     """Accelerometer with rotated axes, or that measures the acceleration of free fall."""
+
     def changed(sample: ImuSample) -> ImuSample:
         if sample.linear_acceleration is None:
             return sample
         x, y, z = sign * rotation.apply(sample.linear_acceleration)
         return replace(sample, linear_acceleration=(float(x), float(y), float(z)))
+
     return _received(changed)
 
 
@@ -172,20 +194,28 @@ def _rectified(points: Array, camera: RollingShutterCamera) -> Array:
 
 def _rectified_image(image: Gray, camera: RollingShutterCamera) -> Gray:
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.column_stack([(u.ravel() - camera.cx) / camera.fx,
-                            (v.ravel() - camera.cy) / camera.fy, np.ones(u.size)])
+    rays = np.column_stack(
+        [(u.ravel() - camera.cx) / camera.fx, (v.ravel() - camera.cy) / camera.fy, np.ones(u.size)]
+    )
     source = camera.project(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
-    return np.asarray(cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR),
-                      dtype=np.uint8)
+    return np.asarray(
+        cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR), dtype=np.uint8
+    )
 
 
 def _reversed_order(columns: bool, rows: bool) -> Geometry:
     """Columns and rows of the image in reverse order."""
+
     def points(pixels: Array, camera: RollingShutterCamera) -> Array:
         last = np.array([camera.width - 1.0, camera.height - 1.0])
         return np.where([columns, rows], last - pixels, pixels)
-    return Geometry(points, lambda image, camera: np.ascontiguousarray(
-        image[::-1 if rows else 1, ::-1 if columns else 1]))
+
+    return Geometry(
+        points,
+        lambda image, camera: np.ascontiguousarray(
+            image[:: -1 if rows else 1, :: -1 if columns else 1]
+        ),
+    )
 
 
 RECTIFIED = Geometry(_rectified, _rectified_image)
@@ -206,36 +236,56 @@ ROWS: Mapping[str, Row] = {
     'K-1.3': Row(('focal_length',), GROSS, _focal_length(1.3), _error('focal_length', 0.3)),
     'K-1.05': Row(('focal_length',), GROSS, _focal_length(1.05), _error('focal_length', 0.05)),
     'no-distortion': Row(('distortion',), GROSS, _without_distortion, _distortion_error),
-    'rectified': Row(('distortion', 'image_geometry'), GROSS, _shown(RECTIFIED),
-                     _distortion_error),
+    'rectified': Row(
+        ('distortion', 'image_geometry'), GROSS, _shown(RECTIFIED), _distortion_error
+    ),
     'upside-down': Row(('image_geometry',), GROSS, _shown(UPSIDE_DOWN)),
     'flipped': Row(('image_geometry',), GROSS, _shown(FLIPPED)),
     'imu-late-30ms': Row(
-        ('time_offset',), GROSS,
+        ('time_offset',),
+        GROSS,
         _received(lambda sample: replace(sample, stamp_ns=sample.stamp_ns + 30_000_000)),
-        _error('time_offset', 0.03)),
+        _error('time_offset', 0.03),
+    ),
     'readout-2': Row(('readout_time',), GROSS, *_readout(2.0)),
     'readout-0.5': Row(('readout_time',), GROSS, *_readout(0.5)),
     'readout-0': Row(('readout_time',), GROSS, *_readout(0.0)),
     'accel-cycled': Row(('accel_axes',), SMALL, _accel(_CYCLE, 1.0)),
     'accel-opposite': Row(('accel_axes',), SMALL, _accel(Rotation.identity(), -1.0)),
-    'axes-3deg': Row(('axes',), SMALL, _axes_rotated(_three_degrees), lambda right, rng: Injected(
-        'axes', right.R_cam_imu.apply(_three_degrees(rng).as_rotvec()))),
+    'axes-3deg': Row(
+        ('axes',),
+        SMALL,
+        _axes_rotated(_three_degrees),
+        lambda right, rng: Injected(
+            'axes', right.R_cam_imu.apply(_three_degrees(rng).as_rotvec())
+        ),
+    ),
     'offset-10ms': Row(
-        ('time_offset',), SMALL,
+        ('time_offset',),
+        SMALL,
         lambda right, rng: right.with_values(time_offset=right.values['time_offset'] + 0.01),
-        _error('time_offset', 0.01)),
+        _error('time_offset', 0.01),
+    ),
     'readout-1.2': Row(('readout_time',), SMALL, *_readout(1.2)),
     'readout-0.8': Row(('readout_time',), SMALL, *_readout(0.8)),
-    'bias-0.05': Row(('gyro_bias',), SMALL, _biased, lambda right, rng: Injected(
-        'gyro_bias', right.R_cam_imu.apply(_random_vector(rng, 0.05)))),
+    'bias-0.05': Row(
+        ('gyro_bias',),
+        SMALL,
+        _biased,
+        lambda right, rng: Injected('gyro_bias', right.R_cam_imu.apply(_random_vector(rng, 0.05))),
+    ),
     'gyro-0.95': Row(('gyro_scale',), SMALL, _gyro_times(0.95), _error('gyro_scale', 0.05)),
     'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97), _error('focal_length', 0.03)),
     'mirrored': Row(('image_geometry',), SMALL, _shown(MIRRORED)),
     # Reading up instead of down is an error of twice the readout time.
-    'direction-reversed': Row(('readout_direction',), SMALL, _reversed,
-                              lambda right, rng: Injected('readout_time', np.array(
-                                  [2.0 * right.values['readout_time']]))),
+    'direction-reversed': Row(
+        ('readout_direction',),
+        SMALL,
+        _reversed,
+        lambda right, rng: Injected(
+            'readout_time', np.array([2.0 * right.values['readout_time']])
+        ),
+    ),
 }
 
 
@@ -251,9 +301,10 @@ ROWS: Mapping[str, Row] = {
 # Nothing of `rs_relpose_ros.estimator` or `rs_relpose_ros.health` is used.
 
 _ENDS = dict(zip(QUANTITIES, accumulate(QUANTITIES.values()), strict=True))
-PLACES: Mapping[str, slice] = {name: slice(end - QUANTITIES[name], end)
-                               for name, end in _ENDS.items()}
-_UNKNOWNS = 11   # x: rotation, direction of translation, velocities
+PLACES: Mapping[str, slice] = {
+    name: slice(end - QUANTITIES[name], end) for name, end in _ENDS.items()
+}
+_UNKNOWNS = 11  # x: rotation, direction of translation, velocities
 _FREE = sum(QUANTITIES.values())
 # Of the finite differences, in the units of `Injected` and of x.
 _STEP = 1e-5
@@ -274,16 +325,16 @@ _MOST_MATCHES = 150
 class TruePair(NamedTuple):
     """A pair with its true pose: ``X1 = R X2 + t`` of the middle rows, |t| = 1."""
 
-    pixels1: Array   # (N, 2) of the inliers, on the sensor
+    pixels1: Array  # (N, 2) of the inliers, on the sensor
     pixels2: Array
     R: Array
     t: Array
     interval: float
-    rates1: Array   # (N, 3) mean true rate [rad/s] from the middle row to each match's row
+    rates1: Array  # (N, 3) mean true rate [rad/s] from the middle row to each match's row
     rates2: Array
-    rate1: Array   # (3,) at the middle row; all rates are in the camera frame
+    rate1: Array  # (3,) at the middle row; all rates are in the camera frame
     rate2: Array
-    sigma: float   # of a match [px]
+    sigma: float  # of a match [px]
     gyro_noise_density: float
 
 
@@ -301,10 +352,13 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> tuple[Arra
     by_images = by_x[:-3].T @ by_x[:-3]
     information = np.linalg.inv(np.linalg.inv(by_images)[:3, :3])
     rotation = Rotation.from_matrix(pair.R).as_rotvec()
-    length = (math.sqrt(float(rotation @ information @ rotation))
-              / max(float(np.linalg.norm(rotation)), 1e-9))
-    return (by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
-            length**2 * np.outer(rotation, rotation))
+    length = math.sqrt(float(rotation @ information @ rotation)) / max(
+        float(np.linalg.norm(rotation)), 1e-9
+    )
+    return (
+        by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
+        length**2 * np.outer(rotation, rotation),
+    )
 
 
 class _Residuals:
@@ -315,15 +369,21 @@ class _Residuals:
 
     def __init__(self, pair: TruePair, camera: RollingShutterCamera) -> None:
         chosen = slice(None, None, -(-len(pair.pixels1) // _MOST_MATCHES))
-        self._pair = pair._replace(pixels1=pair.pixels1[chosen], pixels2=pair.pixels2[chosen],
-                                   rates1=pair.rates1[chosen], rates2=pair.rates2[chosen])
+        self._pair = pair._replace(
+            pixels1=pair.pixels1[chosen],
+            pixels2=pair.pixels2[chosen],
+            rates1=pair.rates1[chosen],
+            rates2=pair.rates2[chosen],
+        )
         # Each match represents those that were left out.
         self._sigma = max(pair.sigma, _LEAST_PIXEL) * math.sqrt(
-            len(self._pair.pixels1) / len(pair.pixels1))
+            len(self._pair.pixels1) / len(pair.pixels1)
+        )
         self._camera = camera
         self._tangent = np.linalg.svd(pair.t[None])[2][1:]
         self._rotation_sigma = math.hypot(
-            _LEAST_ROTATION, pair.gyro_noise_density * math.sqrt(pair.interval))
+            _LEAST_ROTATION, pair.gyro_noise_density * math.sqrt(pair.interval)
+        )
         self._slopes = self._gradient_lengths()
 
     def __call__(self, unknowns: Array) -> Array:
@@ -338,9 +398,13 @@ class _Residuals:
         slower = d - (t - pair.t)[:, None] / pair.interval
         # Prior of the rotation: Log(R R_gyro(c)^T), whose change by c is linear.
         theta = x[:, :3] - self._gyro_change(c)
-        return np.hstack([
-            matches / (self._sigma * self._slopes), slower.reshape(count, 6) / _VELOCITY_SIGMA,
-            theta / self._rotation_sigma])
+        return np.hstack(
+            [
+                matches / (self._sigma * self._slopes),
+                slower.reshape(count, 6) / _VELOCITY_SIGMA,
+                theta / self._rotation_sigma,
+            ]
+        )
 
     def _gyro_change(self, c: Array) -> Array:
         """Change (K, 3) of the gyro's rotation by c (K, 11): axes, offset, bias, scale.
@@ -351,10 +415,12 @@ class _Residuals:
         axes = c[:, PLACES['axes']]
         mean = 0.5 * pair.interval * (np.eye(3) + pair.R)
         return np.asarray(
-            axes - axes @ pair.R.T
+            axes
+            - axes @ pair.R.T
             + c[:, PLACES['time_offset']] * (pair.R @ pair.rate2 - pair.rate1)
             - c[:, PLACES['gyro_bias']] @ mean.T
-            + c[:, PLACES['gyro_scale']] * Rotation.from_matrix(pair.R).as_rotvec())
+            + c[:, PLACES['gyro_scale']] * Rotation.from_matrix(pair.R).as_rotvec()
+        )
 
     def _matches(self, R: Array, t: Array, velocities: Array, c: Array) -> Array:
         """``(p_2 - p_1) . (g_1 x g_2)`` (K, N) of rays and positions at their rows."""
@@ -372,8 +438,9 @@ class _Residuals:
         times = (readout * away / camera.height)[..., None]
         # The gyro's rate with c; its change within the offset is in the rotation between the
         # frames.
-        axes, bias, scale = (c[:, None, PLACES[name]]
-                             for name in ('axes', 'gyro_bias', 'gyro_scale'))
+        axes, bias, scale = (
+            c[:, None, PLACES[name]] for name in ('axes', 'gyro_bias', 'gyro_scale')
+        )
         angles = times * ((1.0 + scale) * (rates + np.cross(axes, rates)) - bias)
         rays = self._rays(pixels, c)
         once = np.cross(angles, rays)
@@ -406,8 +473,9 @@ class _Residuals:
     def _at_truth(self) -> Array:
         pair = self._pair
         velocities = np.stack([pair.t, pair.t]) / pair.interval
-        return np.asarray(self._matches(pair.R[None], pair.t[None], velocities[None],
-                                        np.zeros((1, _FREE)))[0])
+        return np.asarray(
+            self._matches(pair.R[None], pair.t[None], velocities[None], np.zeros((1, _FREE)))[0]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -425,13 +493,14 @@ class InformativeMotion:
         """
         if injected is None:
             # A quarter turn, squared in sigmas, by rotation about one axis and about a second.
-            quarter = (math.pi / 2)**2
+            quarter = (math.pi / 2) ** 2
             each = quarter * np.linalg.eigvalsh(self.rotations)[:, 2]
             so_far = quarter * np.linalg.eigvalsh(np.cumsum(self.rotations, axis=0))[:, 1]
         else:
             each, so_far = (
                 np.array([_squared_error(injected, quantities) for quantities in information])
-                for information in (self.quantities, np.cumsum(self.quantities, axis=0)))
+                for information in (self.quantities, np.cumsum(self.quantities, axis=0))
+            )
         return np.asarray((so_far >= INFORMATIVE**2) & (each >= _LEAST_PART * INFORMATIVE**2))
 
 
@@ -440,7 +509,7 @@ def _squared_error(injected: Injected, quantities: Array) -> float:
     place = np.arange(_FREE)[PLACES[injected.quantity]]
     rest = np.setdiff1d(np.arange(_FREE), place)
     # The quantity itself has no prior.
-    others = quantities[np.ix_(rest, rest)] + np.diag(1.0 / _BEFORE[rest]**2)
+    others = quantities[np.ix_(rest, rest)] + np.diag(1.0 / _BEFORE[rest] ** 2)
     mixed = quantities[np.ix_(rest, place)]
     alone = quantities[np.ix_(place, place)] - mixed.T @ np.linalg.solve(others, mixed)
     return float(injected.error @ alone @ injected.error)

@@ -70,12 +70,12 @@ class TrackNoise:
     As the camera moves on, each corner slips off its place, in a direction of its own.
     """
 
-    white: float = 0.04   # 1 sigma per coordinate of each match [px]
-    slip: float = 0.08   # of the corner's place, times Student's t [px]
-    freedom: float = 2.5   # degrees of freedom of that
-    settled: float = 0.2   # [m] within which it slips
-    wrong: float = 0.003   # share of corners that slide on
-    slide: float = 10.0   # times a normal number [px/m]
+    white: float = 0.04  # 1 sigma per coordinate of each match [px]
+    slip: float = 0.08  # of the corner's place, times Student's t [px]
+    freedom: float = 2.5  # degrees of freedom of that
+    settled: float = 0.2  # [m] within which it slips
+    wrong: float = 0.003  # share of corners that slide on
+    slide: float = 10.0  # times a normal number [px/m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,11 +84,11 @@ class Sightings:
 
     # Of each frame's corners (N,), increasing; one that is lost does not come back.
     ids: tuple[Ids, ...]
-    pixels: tuple[Array, ...]   # their places (N, 2) on the sensor
-    noise: tuple[Array, ...]   # standard normal (N, 2)
-    travelled: Array   # (F,) way of the camera up to each frame [m]
-    slips: Array   # (M, 2) by id [px]
-    slides: Array   # (M, 2) by id [px/m]
+    pixels: tuple[Array, ...]  # their places (N, 2) on the sensor
+    noise: tuple[Array, ...]  # standard normal (N, 2)
+    travelled: Array  # (F,) way of the camera up to each frame [m]
+    slips: Array  # (M, 2) by id [px]
+    slides: Array  # (M, 2) by id [px/m]
     errors: TrackNoise
 
 
@@ -112,7 +112,7 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
         there, hits = simulation.renderer.locate(time, pixels)
         ids = np.concatenate([ids, following + np.arange(len(new))])
         following += len(new)
-        world = np.concatenate([world, there[len(world):]])
+        world = np.concatenate([world, there[len(world) :]])
         # Not where another surface hides it, nor where there is no surface.
         kept = (hits >= 0) & (np.linalg.norm(there - world, axis=1) < _HIDDEN)
         ids, world, pixels = ids[kept], world[kept], pixels[kept]
@@ -124,10 +124,15 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
     sigmas = noise.slip / np.sqrt(rng.chisquare(noise.freedom, following) / noise.freedom)
     slides = noise.slide * (rng.uniform(size=following) < noise.wrong)
     directions = rng.standard_normal((2, following, 2))
-    return Sightings(tuple(observed_ids), tuple(observed_pixels),
-                     tuple(rng.standard_normal((len(frame), 2)) for frame in observed_ids),
-                     np.cumsum(steps), sigmas[:, None] * directions[0],
-                     slides[:, None] * directions[1], noise)
+    return Sightings(
+        tuple(observed_ids),
+        tuple(observed_pixels),
+        tuple(rng.standard_normal((len(frame), 2)) for frame in observed_ids),
+        np.cumsum(steps),
+        sigmas[:, None] * directions[0],
+        slides[:, None] * directions[1],
+        noise,
+    )
 
 
 def _new_corners(rng: np.random.Generator, taken: Array, width: int, height: int) -> Array:
@@ -136,7 +141,7 @@ def _new_corners(rng: np.random.Generator, taken: Array, width: int, height: int
     if missing <= 0:
         return np.empty((0, 2))
     drawn = rng.uniform(_BORDER, (width - 1 - _BORDER, height - 1 - _BORDER), (3 * missing, 2))
-    apart = keep_apart(np.concatenate([taken, drawn]), _LEAST_DISTANCE)[len(taken):]
+    apart = keep_apart(np.concatenate([taken, drawn]), _LEAST_DISTANCE)[len(taken) :]
     return drawn[apart][:missing]
 
 
@@ -192,21 +197,28 @@ class SimulatedTracker:
         self._frame, self._shape = number_of(image), (image.shape[0], image.shape[1])
         self.promote()
 
-    def track(self, image: Image, predicted: Array | None = None,
-              interval: float = 1.0) -> Matches:
+    def track(
+        self, image: Image, predicted: Array | None = None, interval: float = 1.0
+    ) -> Matches:
         """Find the corners in `image`, as `Tracker.track` does."""
         self._frame = number_of(image)
         frame, known = self._frame, self._sightings
         rows = np.searchsorted(known.ids[frame], self._corners)
         rows = np.minimum(rows, len(known.ids[frame]) - 1)
         way = known.travelled[frame] - known.travelled[self._reference]
-        places = (known.pixels[frame][rows] + self._offsets
-                  + known.errors.white * known.noise[frame][rows]
-                  + min(way / known.errors.settled, 1.0) * known.slips[self._corners]
-                  + way * known.slides[self._corners])
+        places = (
+            known.pixels[frame][rows]
+            + self._offsets
+            + known.errors.white * known.noise[frame][rows]
+            + min(way / known.errors.settled, 1.0) * known.slips[self._corners]
+            + way * known.slides[self._corners]
+        )
         points = self._published(places)
-        expected = points if predicted is None else np.where(
-            np.isfinite(predicted), predicted, self._matches.points2)
+        expected = (
+            points
+            if predicted is None
+            else np.where(np.isfinite(predicted), predicted, self._matches.points2)
+        )
         reached = np.linalg.norm(points - expected, axis=1) < _REACH
         if np.count_nonzero(~reached) > _MOST_LOST * len(reached):
             # Then `KltTracker` searches at the previous positions.
@@ -228,7 +240,7 @@ class SimulatedTracker:
         corners, places = self._corners[kept], self._places[kept]
         free = ~np.isin(ids, corners) & self._inside(self._published(pixels))
         # Any of them, but the same ones in every run.
-        order = np.argsort(ids[free] * _SCATTER % 2**32)[:max(self._most - len(corners), 0)]
+        order = np.argsort(ids[free] * _SCATTER % 2**32)[: max(self._most - len(corners), 0)]
         new, new_places = ids[free][order], pixels[free][order]
         self._corners = np.concatenate([corners, new])
         self._places = np.concatenate([places, new_places])
@@ -236,15 +248,21 @@ class SimulatedTracker:
         self._offsets = self._places - pixels[rows]
         points = self._published(self._places)
         self._matches = Matches(
-            np.concatenate([self._matches.track_ids[kept], self._ids.take(len(new))]), points,
-            points, np.ones(len(points)))
+            np.concatenate([self._matches.track_ids[kept], self._ids.take(len(new))]),
+            points,
+            points,
+            np.ones(len(points)),
+        )
         self._started, self._reference = len(points), self._frame
 
     def _inside(self, points: Array) -> NDArray[np.bool_]:
         """Which points (N, 2) of the published image are clear of its border."""
         height, width = self._shape
-        return np.asarray(((points >= _BORDER) & (points <= (width - 1 - _BORDER,
-                                                             height - 1 - _BORDER))).all(axis=1))
+        return np.asarray(
+            ((points >= _BORDER) & (points <= (width - 1 - _BORDER, height - 1 - _BORDER))).all(
+                axis=1
+            )
+        )
 
 
 # -- runs of a recording ----------------------------------------------------------------------
@@ -281,16 +299,16 @@ class Recording:
     """Input of a run, and the truth."""
 
     source: Source
-    configured: trust_rows.Configured   # right
+    configured: trust_rows.Configured  # right
     camera: RollingShutterCamera
     arrivals: Sequence[Arrival]
     samples: Sequence[ImuSample]
-    image: Callable[[int], Gray]   # of a frame's number, from the sensor
-    sightings: Sightings | None   # tracks in place of images
+    image: Callable[[int], Gray]  # of a frame's number, from the sensor
+    sightings: Sightings | None  # tracks in place of images
     # R and t [m] of the stamped rows of two stamps; None where it is unknown.
     true_pose: Callable[[int, int], tuple[Array, Array] | None]
-    rate_stamps_ns: NDArray[np.int64]   # (K,) on the IMU's clock
-    rates: Array   # (K, 3) true angular rate [rad/s], camera frame
+    rate_stamps_ns: NDArray[np.int64]  # (K,) on the IMU's clock
+    rates: Array  # (K, 3) true angular rate [rad/s], camera frame
 
     @property
     def seconds(self) -> float:
@@ -298,12 +316,14 @@ class Recording:
         return seconds_between(self.arrivals[0].stamp_ns, self.arrivals[-1].stamp_ns)
 
 
-def simulated(source: Source, simulation: Simulation, noise: TrackNoise | None,
-              rng: np.random.Generator) -> Recording:
+def simulated(
+    source: Source, simulation: Simulation, noise: TrackNoise | None, rng: np.random.Generator
+) -> Recording:
     """A recording of a simulation: tracks with `noise`, or rendered images where it is None."""
     config, imu = simulation.config, simulation.imu
-    reference_ns = {simulation.stamp_ns(k): simulation.reference_ns(k)
-                    for k in range(config.frame_count)}
+    reference_ns = {
+        simulation.stamp_ns(k): simulation.reference_ns(k) for k in range(config.frame_count)
+    }
     shape = (config.height, config.width)
     delay_ns = to_nanoseconds(config.time_offset + config.readout_time + IMAGE_DELAY)
 
@@ -320,30 +340,33 @@ def simulated(source: Source, simulation: Simulation, noise: TrackNoise | None,
         imu.samples(),
         (lambda number: numbered_image(number, shape)) if noise is not None else simulation.image,
         None if noise is None else sightings(simulation, noise, rng),
-        true_pose, imu.stamps_ns, simulation.states(imu.stamps_ns).angular_velocity)
-
+        true_pose,
+        imu.stamps_ns,
+        simulation.states(imu.stamps_ns).angular_velocity,
+    )
 
 
 def walk_of(simulation: Simulation, rng: np.random.Generator, remark: str = '') -> Recording:
     """Tracks of a simulated walk with the usual noise."""
     config = simulation.config
-    return simulated(Source(f'{config.scene} {config.seed}{remark}', TRACKS), simulation,
-                     TrackNoise(), rng)
+    return simulated(
+        Source(f'{config.scene} {config.seed}{remark}', TRACKS), simulation, TrackNoise(), rng
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedPair:
     """A pair of a run, against the truth; NaN without a pose."""
 
-    at: float   # stamp since the recording's first [s]
-    state: str   # of the consistency monitor
-    named: tuple[str, ...]   # parameters that it names
-    seconds: float   # wall time of its frame
-    chi_direction: float = math.nan   # error squared in sigmas, 2 degrees of freedom
-    chi_rotation: float = math.nan   # likewise, 3
-    direction_error: float = math.nan   # [deg]
-    rotation_error: float = math.nan   # [deg]
-    direction_sigma: float = math.nan   # claimed, 1 sigma [deg]
+    at: float  # stamp since the recording's first [s]
+    state: str  # of the consistency monitor
+    named: tuple[str, ...]  # parameters that it names
+    seconds: float  # wall time of its frame
+    chi_direction: float = math.nan  # error squared in sigmas, 2 degrees of freedom
+    chi_rotation: float = math.nan  # likewise, 3
+    direction_error: float = math.nan  # [deg]
+    rotation_error: float = math.nan  # [deg]
+    direction_sigma: float = math.nan  # claimed, 1 sigma [deg]
 
     @property
     def has_pose(self) -> bool:
@@ -351,32 +374,48 @@ class EvaluatedPair:
         return not math.isnan(self.direction_error)
 
 
-def run(recording: Recording, configured: trust_rows.Configured, until: float = math.inf,
-        ) -> Iterator[tuple[PairResult, float]]:
+def run(
+    recording: Recording,
+    configured: trust_rows.Configured,
+    until: float = math.inf,
+) -> Iterator[tuple[PairResult, float]]:
     """Pairs of a run with a configuration, and the wall time of their frames [s].
 
     `until` [s]: frames after that are not processed.
     """
     parameters = Parameters.from_mapping(configured.values)
     camera, known = recording.camera, recording.sightings
-    tracker = None if known is None else SimulatedTracker(
-        known, lambda points: configured.geometry.points(points, camera),
-        parameters.tracking.max_features)
+    tracker = (
+        None
+        if known is None
+        else SimulatedTracker(
+            known,
+            lambda points: configured.geometry.points(points, camera),
+            parameters.tracking.max_features,
+        )
+    )
     front_end = FrontEnd(parameters, offline=True, tracker=tracker)
     for frame in processed(recording, configured, front_end, until):
         if frame.result is not None:
             yield frame.result, frame.seconds
 
 
-def processed(recording: Recording, configured: trust_rows.Configured, loop: FrameLoop[Result],
-              until: float = math.inf) -> Iterator[Frame[Result]]:
+def processed(
+    recording: Recording,
+    configured: trust_rows.Configured,
+    loop: FrameLoop[Result],
+    until: float = math.inf,
+) -> Iterator[Frame[Result]]:
     """Frames of a run with a configuration, processed by a loop; `until` as of `run`."""
     camera = recording.camera
     first_ns = recording.arrivals[0].stamp_ns
     imu_delay_ns = to_nanoseconds(IMU_DELAY)
     samples: Sequence[ImuSample | Arrival] = recording.samples
-    frames = [arrival for arrival in recording.arrivals
-              if seconds_between(first_ns, arrival.stamp_ns) <= until]
+    frames = [
+        arrival
+        for arrival in recording.arrivals
+        if seconds_between(first_ns, arrival.stamp_ns) <= until
+    ]
 
     def arrival_ns(item: ImuSample | Arrival) -> int:
         return item.arrives_ns if isinstance(item, Arrival) else item.stamp_ns + imu_delay_ns
@@ -389,7 +428,8 @@ def processed(recording: Recording, configured: trust_rows.Configured, loop: Fra
             if recording.sightings is None:
                 image = configured.geometry.image(image, camera)
             loop.sequencer.add_frame(
-                RawImage.of_gray(image, arrived.stamp_ns, CAMERA_FRAME), configured.intrinsics)
+                RawImage.of_gray(image, arrived.stamp_ns, CAMERA_FRAME), configured.intrinsics
+            )
         yield from _taken(loop)
     loop.close()
     yield from _taken(loop)
@@ -405,8 +445,10 @@ def evaluated(recording: Recording, pair: PairResult, seconds: float) -> Evaluat
     """A pair against the truth."""
     at = seconds_between(recording.arrivals[0].stamp_ns, pair.stamp_ns)
     pose = pair.pose
-    verdict = pair.health.state.value, tuple(
-        finding.quantity for finding in pair.health.findings if finding.state in FLAGGED)
+    verdict = (
+        pair.health.state.value,
+        tuple(finding.quantity for finding in pair.health.findings if finding.state in FLAGGED),
+    )
     truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns) if pose else None
     if truth is None or not np.linalg.norm(truth[1]) > 0.0:
         return EvaluatedPair(at, *verdict, seconds)
@@ -414,17 +456,27 @@ def evaluated(recording: Recording, pair: PairResult, seconds: float) -> Evaluat
     chi = chi_squares(pose.R, pose.t, *truth, pose.covariance)
     # Of the two directions across t the mean variance.
     sigma = math.degrees(math.sqrt(0.5 * float(np.trace(pose.covariance[:3, :3]))))
-    return EvaluatedPair(at, *verdict, seconds, chi.translation, chi.rotation, error.translation,
-                         error.rotation, sigma)
+    return EvaluatedPair(
+        at,
+        *verdict,
+        seconds,
+        chi.translation,
+        chi.rotation,
+        error.translation,
+        error.rotation,
+        sigma,
+    )
 
 
-def informative_motion(recording: Recording,
-                       pairs: Sequence[PairResult]) -> trust_rows.InformativeMotion:
+def informative_motion(
+    recording: Recording, pairs: Sequence[PairResult]
+) -> trust_rows.InformativeMotion:
     """Information of each second of a recording, by the pairs of a run, configured right."""
     count = math.ceil(recording.seconds) + 1
     unknowns = sum(trust_rows.QUANTITIES.values())
-    motion = trust_rows.InformativeMotion(np.zeros((count, unknowns, unknowns)),
-                                          np.zeros((count, 3, 3)))
+    motion = trust_rows.InformativeMotion(
+        np.zeros((count, unknowns, unknowns)), np.zeros((count, 3, 3))
+    )
     for pair in pairs:
         true = _true_pair(recording, pair)
         if true is not None:
@@ -454,8 +506,18 @@ def _true_pair(recording: Recording, pair: PairResult) -> trust_rows.TruePair | 
         middles.append(_rate_at(recording, reference_ns + middle_ns, np.zeros(1))[0])
     config = Parameters.from_mapping(recording.configured.values).imu
     return trust_rows.TruePair(
-        pixels[0], pixels[1], R, t / np.linalg.norm(t), pair.interval, rates[0], rates[1],
-        middles[0], middles[1], pair.pose.residual_rms, config.gyro_noise_density)
+        pixels[0],
+        pixels[1],
+        R,
+        t / np.linalg.norm(t),
+        pair.interval,
+        rates[0],
+        rates[1],
+        middles[0],
+        middles[1],
+        pair.pose.residual_rms,
+        config.gyro_noise_density,
+    )
 
 
 def _rate_at(recording: Recording, time_ns: int, after: Array) -> Array:
@@ -465,6 +527,7 @@ def _rate_at(recording: Recording, time_ns: int, after: Array) -> Array:
 
 
 # -- bags with images ---------------------------------------------------------------------------
+
 
 def recording_at(path: Path) -> Recording:
     """A bag with the parameters that are right next to it (``BAG.yaml``), and its truth, if any.
@@ -481,21 +544,35 @@ def recording_at(path: Path) -> Recording:
     images = found[Role.IMAGE]
     samples = sorted(found[Role.IMU] + found[Role.ACCEL], key=lambda sample: sample.stamp_ns)
     first = images[0].decoded()
-    intrinsics = (found[Role.CAMERA_INFO] or [
-        parameters.intrinsics.of_image(first.shape[1], first.shape[0])])[0]
+    intrinsics = (
+        found[Role.CAMERA_INFO] or [parameters.intrinsics.of_image(first.shape[1], first.shape[0])]
+    )[0]
     camera = sensor_model(intrinsics, parameters.sensor).camera
     offset_ns = to_nanoseconds(parameters.sensor.time_offset)
     delay_ns = to_nanoseconds(parameters.sensor.time_offset + camera.readout_time + IMAGE_DELAY)
-    gyro = [(sample.stamp_ns, sample.angular_velocity) for sample in samples
-            if sample.angular_velocity is not None]
+    gyro = [
+        (sample.stamp_ns, sample.angular_velocity)
+        for sample in samples
+        if sample.angular_velocity is not None
+    ]
     rates = np.array([rate for _, rate in gyro]) - parameters.imu.gyro_bias
     R_cam_imu = Rotation.from_quat(parameters.sensor.quat_cam_imu_xyzw)
     return Recording(
         Source(path.name, RECORDING),
-        trust_rows.Configured(parameters.to_mapping(), intrinsics), camera,
-        [Arrival(number, image.stamp_ns, image.stamp_ns + delay_ns)
-         for number, image in enumerate(images)],
-        samples, lambda number: images[number].decoded(), None,
-        lambda stamp1_ns, stamp2_ns: None if truth is None else truth.relative_pose(
-            stamp1_ns + offset_ns, stamp2_ns + offset_ns),
-        np.array([stamp for stamp, _ in gyro]), R_cam_imu.apply(rates))
+        trust_rows.Configured(parameters.to_mapping(), intrinsics),
+        camera,
+        [
+            Arrival(number, image.stamp_ns, image.stamp_ns + delay_ns)
+            for number, image in enumerate(images)
+        ],
+        samples,
+        lambda number: images[number].decoded(),
+        None,
+        lambda stamp1_ns, stamp2_ns: (
+            None
+            if truth is None
+            else truth.relative_pose(stamp1_ns + offset_ns, stamp2_ns + offset_ns)
+        ),
+        np.array([stamp for stamp, _ in gyro]),
+        R_cam_imu.apply(rates),
+    )

@@ -37,15 +37,16 @@ def private_domain() -> Iterator[int]:
         path = Path(tempfile.gettempdir()) / f'rs_relpose_ros_domain_{domain_id}.lock'
         try:
             lock = path.open('w')
-        except PermissionError:   # of another user
+        except PermissionError:  # of another user
             continue
         with lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            with mock.patch.dict(os.environ, ROS_DOMAIN_ID=str(domain_id),
-                                 ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'):
+            with mock.patch.dict(
+                os.environ, ROS_DOMAIN_ID=str(domain_id), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'
+            ):
                 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
                 yield domain_id
             return
@@ -91,8 +92,9 @@ class Graph:
 
     def wait_for_publisher(self, topic: str, *processes: Process) -> None:
         """Wait until a topic has a publisher, while processes run."""
-        wait_until(lambda: self.node.count_publishers(topic), f'a publisher of {topic}',
-                   *processes)
+        wait_until(
+            lambda: self.node.count_publishers(topic), f'a publisher of {topic}', *processes
+        )
 
     def publisher(self, message_type: type, topic: str, best_effort: bool = False) -> Any:
         """A publisher with at least one subscription."""

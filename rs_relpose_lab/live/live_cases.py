@@ -34,8 +34,12 @@ from rs_relpose_ros.messages.incoming import stamp_ns
 
 # Of the bag [Hz], of which other cases take each second image; length of a case [s].
 FPS, SECONDS, READOUT = 60, 10.0, 0.02
-_TOPICS = {Image: 'image', CompressedImage: 'image/compressed', CameraInfo: 'camera_info',
-           Imu: 'imu'}
+_TOPICS = {
+    Image: 'image',
+    CompressedImage: 'image/compressed',
+    CameraInfo: 'camera_info',
+    Imu: 'imu',
+}
 
 # Message, its number, and time [s] -> its delays [s], and messages to send.
 Edit = Callable[[Any, int, float], list[tuple[float, Any]]]
@@ -45,62 +49,77 @@ class Case(NamedTuple):
     """One fault: its words, if it has to be named, and what makes it."""
 
     name: str
-    words: str = ''   # regular expression; empty: harmless
+    words: str = ''  # regular expression; empty: harmless
     edits: tuple[Edit, ...] = ()
     parameters: Mapping[str, Any] = MappingProxyType({})
-    every: int = 2    # images of the bag
-    latched: bool = False   # CameraInfo
-    clock: bool = False   # published
-    jump_ns: int = 0   # of all stamps, halfway
+    every: int = 2  # images of the bag
+    latched: bool = False  # CameraInfo
+    clock: bool = False  # published
+    jump_ns: int = 0  # of all stamps, halfway
 
 
 def of(kind: Any, change: Callable[[Any, int, float], Any], delay: float = 0.0) -> Edit:
     """A message of a kind changed in place, or replaced; False: not sent."""
+
     def edit(message: Any, number: int, seconds: float) -> list[tuple[float, Any]]:
         if not isinstance(message, kind):
             return [(0.0, message)]
         found = change(message, number, seconds)
         return [] if found is False else [(delay, message if found is None else found)]
+
     return edit
 
 
 def shifted(kind: Any, shift: Callable[[int, float], float]) -> Edit:
     """Stamps of a kind, later by so many seconds."""
+
     def change(message: Any, number: int, seconds: float) -> None:
         later = stamp_ns(message.header) + round(shift(number, seconds) * NANOSECONDS)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(later, NANOSECONDS)
+
     return of(kind, change)
 
 
 def scaled(rates: Sequence[float], forces: Sequence[float] = (1.0, 1.0, 1.0)) -> tuple[Edit]:
     """Factors of the axes of the IMU."""
+
     def change(message: Imu, *_: object) -> None:
-        for vector, factors in ((message.angular_velocity, rates),
-                                (message.linear_acceleration, forces)):
+        for vector, factors in (
+            (message.angular_velocity, rates),
+            (message.linear_acceleration, forces),
+        ):
             for axis, factor in zip('xyz', factors, strict=True):
                 setattr(vector, axis, factor * getattr(vector, axis))
+
     return (of(Imu, change),)
 
 
 def pictured(make: Callable[[Any], Any], encoding: str = 'mono8') -> Edit:
     """Other pixels, or another encoding."""
-    return of(Image, lambda message, *_: gray_image(
-        message.header, make(pixels_of(message)), encoding))
+    return of(
+        Image, lambda message, *_: gray_image(message.header, make(pixels_of(message)), encoding)
+    )
 
 
 def compressed(message: Image, *_: object) -> CompressedImage:
     """JPEG of an image."""
-    return CompressedImage(header=message.header, format='jpeg', data=array(
-        'B', cv2.imencode('.jpg', pixels_of(message))[1].tobytes()))
+    return CompressedImage(
+        header=message.header,
+        format='jpeg',
+        data=array('B', cv2.imencode('.jpg', pixels_of(message))[1].tobytes()),
+    )
 
 
 def information(*, focal: float = 1.0, size: int = 1, radial: float = 0.0) -> Edit:
     """CameraInfo with another focal length, a size divided by `size`, or first coefficient."""
+
     def change(message: CameraInfo, *_: object) -> None:
         message.width, message.height = message.width // size, message.height // size
-        message.k = np.array(message.k) / [*6 * [size], 1, 1, 1] * [
-            focal, 1, 1, 1, focal, 1, 1, 1, 1]
+        message.k = (
+            np.array(message.k) / [*6 * [size], 1, 1, 1] * [focal, 1, 1, 1, focal, 1, 1, 1, 1]
+        )
         message.d[0] += radial
+
     return of(CameraInfo, change)
 
 
@@ -109,8 +128,11 @@ def _batched(message: Any, number: int, _: float) -> list[tuple[float, Any]]:
 
 
 def _jumped(name: str, seconds: float) -> Case:
-    return Case(name, edits=(shifted((Image, CameraInfo, Imu), lambda _, now: seconds * (
-        now > 0.5 * SECONDS)),), jump_ns=round(seconds * NANOSECONDS))
+    return Case(
+        name,
+        edits=(shifted((Image, CameraInfo, Imu), lambda _, now: seconds * (now > 0.5 * SECONDS)),),
+        jump_ns=round(seconds * NANOSECONDS),
+    )
 
 
 def _turned(message: CameraInfo, *_: object) -> None:
@@ -129,8 +151,11 @@ def _jitter(number: int, _: float) -> float:
 
 def _rotated(degrees: float) -> dict[str, Any]:
     turn = Rotation.from_rotvec([degrees, 0.0, 0.0], degrees=True)
-    return {'quat_cam_imu_xyzw': (turn * Rotation.from_quat(
-        SimulationConfig().quat_cam_imu_xyzw)).as_quat().tolist()}
+    return {
+        'quat_cam_imu_xyzw': (turn * Rotation.from_quat(SimulationConfig().quat_cam_imu_xyzw))
+        .as_quat()
+        .tolist()
+    }
 
 
 _IMAGES = (Image, CameraInfo)
@@ -152,8 +177,11 @@ _CASES = (
     Case('readout 0', 'readout_time', parameters={'readout_time': 0.0}),
     Case('readout x 2', 'readout_time', parameters={'readout_time': 2.0 * READOUT}),
     Case('rows reversed', 'readout_direction', parameters={'readout_direction': 'up'}),
-    Case('stamp at the end of the frame', 'stamp_row|time_offset',
-         (shifted(_IMAGES, lambda *_: READOUT),)),
+    Case(
+        'stamp at the end of the frame',
+        'stamp_row|time_offset',
+        (shifted(_IMAGES, lambda *_: READOUT),),
+    ),
     Case('distortion wrong by k1 -0.12', 'distortion', (information(radial=-0.12),)),
     Case('stamps of arrival, 5 ms of jitter', 'jitter', (shifted(_IMAGES, _jitter),)),
     Case('IMU 50 Hz', '', (of(Imu, lambda _, number, *__: None if number % 4 == 0 else False),)),
@@ -163,53 +191,99 @@ _CASES = (
     Case('16UC1', '', (pictured(lambda image: 257 * image.astype(np.uint16), '16UC1'),)),
     Case('Bayer', '', (pictured(lambda image: image, 'bayer_rggb8'),)),
     Case('JPEG', '', (of(Image, compressed),), {'image_transport': 'compressed'}),
-    Case('reliable', '', parameters={
-        'qos_overrides./image.subscription.reliability': 'reliable'}),
+    Case('reliable', '', parameters={'qos_overrides./image.subscription.reliability': 'reliable'}),
     Case('JPEG only, raw configured', 'image_transport', (of(Image, compressed),)),
-    Case('QoS that does not match', 'QoS|qos|reliability', parameters={
-        'qos_overrides./image.subscription.durability': 'transient_local'}),
+    Case(
+        'QoS that does not match',
+        'QoS|qos|reliability',
+        parameters={'qos_overrides./image.subscription.durability': 'transient_local'},
+    ),
     Case('no CameraInfo', 'CameraInfo|camera_info', (of(CameraInfo, lambda *_: False),)),
-    Case('CameraInfo once, latched', '', (
-        of(CameraInfo, lambda _, number, *__: False if number else None),), latched=True),
+    Case(
+        'CameraInfo once, latched',
+        '',
+        (of(CameraInfo, lambda _, number, *__: False if number else None),),
+        latched=True,
+    ),
     _jumped('clock -50 s', -50.0),
     _jumped('clock +100 s', 100.0),
     _jumped('bag looped', -SECONDS),
     Case('simulated time, with clock', '', (), {'use_sim_time': True}, clock=True),
     Case('simulated time, without clock', '', (), {'use_sim_time': True}),
-    Case('5 Hz', '', every=12), Case('10 Hz', '', every=6), Case('60 Hz', '', every=1),
-    Case('30 % of the images dropped', '', (
-        of(Image, lambda _, number, *__: None if number * 7 % 10 < 7 else False),)),
-    Case('image rotated by 90 deg', 'rotated', (
-        pictured(lambda image: np.rot90(image)), of(CameraInfo, _turned))),
+    Case('5 Hz', '', every=12),
+    Case('10 Hz', '', every=6),
+    Case('60 Hz', '', every=1),
+    Case(
+        '30 % of the images dropped',
+        '',
+        (of(Image, lambda _, number, *__: None if number * 7 % 10 < 7 else False),),
+    ),
+    Case(
+        'image rotated by 90 deg',
+        'rotated',
+        (pictured(lambda image: np.rot90(image)), of(CameraInfo, _turned)),
+    ),
     Case('flipped vertically', 'mirror|upside down', (pictured(lambda image: image[::-1]),)),
     Case('flipped horizontally', 'mirror|upside down', (pictured(lambda image: image[:, ::-1]),)),
     Case('zero stamps, 1 in 6', 'stamp', (of(Image, _zero),)),
-    Case('far future, 1 in 3', 'stamp', (shifted(
-        Image, lambda number, _: 0.0 if number % 3 else 1e6),)))
+    Case(
+        'far future, 1 in 3',
+        'stamp',
+        (shifted(Image, lambda number, _: 0.0 if number % 3 else 1e6),),
+    ),
+)
 CASES = {case.name: case for case in _CASES}
 
 
-def play(case: Case, folder: Path) -> tuple[
-        Path, float, list[PoseWithCovarianceStamped], list[TimeReference], str]:
+def play(
+    case: Case, folder: Path
+) -> tuple[Path, float, list[PoseWithCovarianceStamped], list[TimeReference], str]:
     """Play a case to a node of its own; the bag is rendered once into `folder`.
 
     Returns the bag, the first seconds of the words (NaN: never), what was published, and the
     node's last message.
     """
-    bag, file = render_once(SimulationConfig(
-        duration=SECONDS, fps=FPS, width=480, height=360, fx=340.0, edge_samples=1, seed=24,
-        plan=f'walk:{SECONDS:g}', readout_time=READOUT), folder)
-    values = {name: list(value) if isinstance(value, tuple) else value for name, value in {
-        **file_values(file), 'image_transport': 'raw', **case.parameters}.items()}
+    bag, file = render_once(
+        SimulationConfig(
+            duration=SECONDS,
+            fps=FPS,
+            width=480,
+            height=360,
+            fx=340.0,
+            edge_samples=1,
+            seed=24,
+            plan=f'walk:{SECONDS:g}',
+            readout_time=READOUT,
+        ),
+        folder,
+    )
+    values = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in {
+            **file_values(file),
+            'image_transport': 'raw',
+            **case.parameters,
+        }.items()
+    }
     named, messages = math.nan, _messages(bag, case)
     with private_domain(), Graph() as graph, node_process(parameters=values) as node:
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         references = graph.listen(TimeReference, '/relpose_node/reference')
-        publishers = {kind: graph.node.create_publisher(kind, topic, QoSProfile(
-            depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL if case.latched
-            and kind is CameraInfo else DurabilityPolicy.VOLATILE))
-            for kind, topic in _TOPICS.items() if kind in {type(item) for _, item in messages}}
+        publishers = {
+            kind: graph.node.create_publisher(
+                kind,
+                topic,
+                QoSProfile(
+                    depth=200,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL
+                    if case.latched and kind is CameraInfo
+                    else DurabilityPolicy.VOLATILE,
+                ),
+            )
+            for kind, topic in _TOPICS.items()
+            if kind in {type(item) for _, item in messages}
+        }
         clock = graph.node.create_publisher(Clock, '/clock', 10) if case.clock else None
         node.wait_for('ready: ')
         time.sleep(1.0)
@@ -235,25 +309,35 @@ def _messages(bag: Path, case: Case) -> list[tuple[float, Any]]:
     with reader.open_bag(bag) as opened:
         first_ns, image = 0, -1
         for raw in opened.raw_messages(opened.topics):
-            kind = {reader.COMPRESSED_IMAGE: CompressedImage, reader.CAMERA_INFO: CameraInfo,
-                    reader.IMU: Imu}.get(raw.msgtype)
+            kind = {
+                reader.COMPRESSED_IMAGE: CompressedImage,
+                reader.CAMERA_INFO: CameraInfo,
+                reader.IMU: Imu,
+            }.get(raw.msgtype)
             if kind is None:
                 continue
             first_ns = first_ns or raw.bag_time_ns
             message: Any = deserialize_message(bytes(raw.data), kind)
-            image += kind is CameraInfo   # it comes before its image
+            image += kind is CameraInfo  # it comes before its image
             if kind is not Imu and image % case.every:
                 continue
             if kind is CompressedImage:
-                message = gray_image(message.header, np.asarray(cv2.imdecode(
-                    np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)))
+                message = gray_image(
+                    message.header,
+                    np.asarray(
+                        cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+                    ),
+                )
             seconds = 1e-9 * (raw.bag_time_ns - first_ns)
             number = counts[type(message)]
             counts[type(message)] += 1
             items = [(seconds, message)]
             for edit in case.edits:
-                items = [(at + delay, out) for at, item in items
-                         for delay, out in edit(item, number, seconds)]
+                items = [
+                    (at + delay, out)
+                    for at, item in items
+                    for delay, out in edit(item, number, seconds)
+                ]
             sent += items
     return sorted(sent, key=lambda item: item[0])
 
@@ -265,6 +349,11 @@ def pixels_of(message: Image) -> np.ndarray:
 
 def gray_image(header: Any, pixels: np.ndarray, encoding: str = 'mono8') -> Image:
     """An image of pixels."""
-    return Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
-                 step=pixels.shape[1] * pixels.itemsize,
-                 data=array('B', np.ascontiguousarray(pixels).tobytes()))
+    return Image(
+        header=header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        step=pixels.shape[1] * pixels.itemsize,
+        data=array('B', np.ascontiguousarray(pixels).tobytes()),
+    )

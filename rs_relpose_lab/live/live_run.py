@@ -34,13 +34,24 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
     """
     remap, duration = _remap_and_duration(bag)
     table, stamps = folder / 'live.csv', folder / 'live_stamps.txt'
-    with private_domain(), Graph() as graph, processes.node_process(
-            parameters, remap=remap, parameters={'stamps_file': stamps},
-            log=folder / 'relpose_node.log') as node:
+    with (
+        private_domain(),
+        Graph() as graph,
+        processes.node_process(
+            parameters,
+            remap=remap,
+            parameters={'stamps_file': stamps},
+            log=folder / 'relpose_node.log',
+        ) as node,
+    ):
         recorder = Recorder(graph, node)
         with processes.player_process(bag, log=folder / 'player.log') as player:
-            processes.wait_until(player.ended, 'the end of the player', node,
-                                 timeout=2.0 * processes.PATIENCE + duration)
+            processes.wait_until(
+                player.ended,
+                'the end of the player',
+                node,
+                timeout=2.0 * processes.PATIENCE + duration,
+            )
         # The node is done when it has processed no frame for a second.
         processes.wait_until_quiet(lambda: stamps.stat().st_size, 1.0, node)
         node.stop()
@@ -67,8 +78,10 @@ class Recorder:
     """
 
     def __init__(self, graph: Graph, node: processes.Process) -> None:
-        self._received = {name: graph.listen(message_class(msgtype), f'/relpose_node/{name}')
-                          for name, msgtype in PAIR_TOPICS.items()}
+        self._received = {
+            name: graph.listen(message_class(msgtype), f'/relpose_node/{name}')
+            for name, msgtype in PAIR_TOPICS.items()
+        }
         for name in PAIR_TOPICS:
             graph.wait_for_publisher(f'/relpose_node/{name}', node)
 
@@ -79,7 +92,8 @@ class Recorder:
         """
         poses, references, matches, pairs = (
             {stamp_ns(msg.header): msg for msg in self._received[name]}
-            for name in ('relative_pose', 'reference', 'matches', 'pairs'))
+            for name in ('relative_pose', 'reference', 'matches', 'pairs')
+        )
         with path.open('w', newline='', encoding='ascii') as file:
             writer = csv.writer(file, lineterminator='\n')
             writer.writerow(POSES.columns)
@@ -89,12 +103,26 @@ class Recorder:
                 values = diagnostic_values(pairs[stamp]) if stamp in pairs else {}
                 covariance = np.array(pose.pose.covariance).reshape(6, 6)
                 t, quat_xyzw = pose_of(pose)
-                writer.writerow([
-                    '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
-                    *map(number, (*t, *quat_xyzw, *translation_sigmas(covariance),
-                                  *rotation_sigmas(covariance))),
-                    '' if cloud is None else str(cloud.width), '', '', Status.OK.value,
-                    *(values.get(name, '') for name in ('baseline_m', 'baseline_log_sigma'))])
+                writer.writerow(
+                    [
+                        '' if reference is None else str(time_ns(reference.time_ref)),
+                        str(stamp),
+                        *map(
+                            number,
+                            (
+                                *t,
+                                *quat_xyzw,
+                                *translation_sigmas(covariance),
+                                *rotation_sigmas(covariance),
+                            ),
+                        ),
+                        '' if cloud is None else str(cloud.width),
+                        '',
+                        '',
+                        Status.OK.value,
+                        *(values.get(name, '') for name in ('baseline_m', 'baseline_log_sigma')),
+                    ]
+                )
         return len(poses)
 
 
@@ -126,14 +154,14 @@ class MeasuredRun:
     """Results of `measure`."""
 
     poses: list[ReceivedPose]
-    counters: dict[str, str]   # last values of the node's diagnostics
+    counters: dict[str, str]  # last values of the node's diagnostics
     # Of the node, once a second while messages are played.
     metrics: list[processes.ProcessMetrics]
     player_metrics: list[processes.ProcessMetrics]
-    started_ns: int   # when the node was started
-    ready_ns: int   # when it had subscribed
-    timings: Path   # table of the node's parameter `timings_file`
-    log: Path   # table of the player
+    started_ns: int  # when the node was started
+    ready_ns: int  # when it had subscribed
+    timings: Path  # table of the node's parameter `timings_file`
+    log: Path  # table of the player
 
 
 class _Listener:
@@ -154,14 +182,22 @@ class _Listener:
         received = []
         for stamp in sorted(self.poses.keys() & references.keys()):
             received_ns, msg = self.poses[stamp]
-            received.append(ReceivedPose(references[stamp], stamp, received_ns,
-                                         *map(np.array, pose_of(msg))))
+            received.append(
+                ReceivedPose(references[stamp], stamp, received_ns, *map(np.array, pose_of(msg)))
+            )
         return received
 
 
-def measure(bag: Path, parameters: Path, remap: dict[str, str], transport: str,
-            player_options: Sequence[str], profile: Path | None, folder: Path,
-            on_second: Callable[[], object]) -> MeasuredRun:
+def measure(
+    bag: Path,
+    parameters: Path,
+    remap: dict[str, str],
+    transport: str,
+    player_options: Sequence[str],
+    profile: Path | None,
+    folder: Path,
+    on_second: Callable[[], object],
+) -> MeasuredRun:
     """Play a bag to a new node and measure; logs and tables into `folder`, which exists.
 
     `parameters`: file of the node, `remap`: its topics image, camera_info and imu by their names
@@ -179,23 +215,41 @@ def measure(bag: Path, parameters: Path, remap: dict[str, str], transport: str,
             listener = _Listener(graph)
             started_ns = time.monotonic_ns()
             with processes.node_process(
-                    parameters, remap=remap, log=folder / 'relpose_node.log',
-                    parameters={'timings_file': timings,
-                                'image_transport': transport}) as node:
-                processes.wait_until(lambda: graph.node.count_subscribers(remap['imu']),
-                                     'a subscription of the node', node)
+                parameters,
+                remap=remap,
+                log=folder / 'relpose_node.log',
+                parameters={'timings_file': timings, 'image_transport': transport},
+            ) as node:
+                processes.wait_until(
+                    lambda: graph.node.count_subscribers(remap['imu']),
+                    'a subscription of the node',
+                    node,
+                )
                 ready_ns = time.monotonic_ns()
-                with processes.player_process(bag, '--log', str(log), *player_options,
-                                              log=folder / 'player.log') as player:
+                with processes.player_process(
+                    bag, '--log', str(log), *player_options, log=folder / 'player.log'
+                ) as player:
                     metrics = _watch(node, player, listener, on_second)
                 processes.wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
                 node.stop()
-        return MeasuredRun(listener.received(), diagnostic_values(listener.diagnostics[-1]),
-                           metrics[0], metrics[1], started_ns, ready_ns, timings, log)
+        return MeasuredRun(
+            listener.received(),
+            diagnostic_values(listener.diagnostics[-1]),
+            metrics[0],
+            metrics[1],
+            started_ns,
+            ready_ns,
+            timings,
+            log,
+        )
 
 
-def _watch(node: processes.Process, player: processes.Process, listener: _Listener,
-           on_second: Callable[[], object]) -> list[list[processes.ProcessMetrics]]:
+def _watch(
+    node: processes.Process,
+    player: processes.Process,
+    listener: _Listener,
+    on_second: Callable[[], object],
+) -> list[list[processes.ProcessMetrics]]:
     """Metrics of node and player from the first pose to the end of the player."""
     of_node: list[processes.ProcessMetrics] = []
     of_player: list[processes.ProcessMetrics] = []
@@ -204,7 +258,7 @@ def _watch(node: processes.Process, player: processes.Process, listener: _Listen
         try:
             of_node.append(processes.process_metrics(node.pid))
             of_player.append(processes.process_metrics(player.pid))
-        except (OSError, KeyError):   # a process has just ended
+        except (OSError, KeyError):  # a process has just ended
             break
         on_second()
         time.sleep(1.0)

@@ -62,8 +62,10 @@ def repeated(messages: Sequence[Outgoing], period_ns: int, duration_ns: int) -> 
     """
     stamps = [stamp_of(message.data) for message in messages]
     if messages and max(stamps) - min(stamps) >= period_ns:
-        raise InputError(f'the recording is {(max(stamps) - min(stamps)) / NANOSECONDS:.3f} s '
-                         f'long, and so has no period of {period_ns / NANOSECONDS:g} s')
+        raise InputError(
+            f'the recording is {(max(stamps) - min(stamps)) / NANOSECONDS:.3f} s '
+            f'long, and so has no period of {period_ns / NANOSECONDS:g} s'
+        )
     # A message due after the period's end is sent among the first messages of the next round.
     order = sorted(range(len(messages)), key=lambda k: messages[k].due_ns % period_ns)
     rounds = 0
@@ -78,8 +80,12 @@ def repeated(messages: Sequence[Outgoing], period_ns: int, duration_ns: int) -> 
                 return
             if message.msgtype in _IMAGES and due_ns >= duration_ns - _TAIL_NS:
                 continue
-            yield Outgoing(due_ns, message.topic, message.msgtype,
-                           _with_stamp(message.data, stamps[k] + repeat_ns))
+            yield Outgoing(
+                due_ns,
+                message.topic,
+                message.msgtype,
+                _with_stamp(message.data, stamps[k] + repeat_ns),
+            )
         rounds += 1
 
 
@@ -92,7 +98,7 @@ def stamp_of(data: bytes) -> int:
 def _with_stamp(data: bytes, stamp_ns: int) -> bytes:
     # One copy: publishers take bytes only.
     stamp = struct.pack(_time_format(data), *divmod(stamp_ns, NANOSECONDS))
-    return b''.join((data[:_STAMP.start], stamp, memoryview(data)[_STAMP.stop:]))
+    return b''.join((data[: _STAMP.start], stamp, memoryview(data)[_STAMP.stop :]))
 
 
 def _time_format(data: bytes) -> str:
@@ -102,8 +108,9 @@ def _time_format(data: bytes) -> str:
 # -- the player -------------------------------------------------------------------------------
 
 # Times at which a message was due and was published, on the monotonic clock [ns].
-LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
-                      ('published_ns', '<i8')])
+LOG_DTYPE = np.dtype(
+    [('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'), ('published_ns', '<i8')]
+)
 
 # Types that the node subscribes to: the player waits for these subscriptions.
 _SENSOR_TYPES = (*_IMAGES, reader.CAMERA_INFO, reader.IMU)
@@ -124,15 +131,18 @@ def play(node: Node, options: argparse.Namespace) -> int:
         publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
         messages = _outgoing(bag, topics, options)
         if options.loop > 0.0:
-            messages = repeated(list(messages), to_nanoseconds(options.loop),
-                                to_nanoseconds(options.duration))
+            messages = repeated(
+                list(messages), to_nanoseconds(options.loop), to_nanoseconds(options.duration)
+            )
             # Garbage collection over so many objects would delay publishing.
             gc.collect()
             gc.freeze()
         if options.wait_for_subscribers > 0.0:
             _wait_for_subscribers(
                 [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
-                options.subscriptions, options.wait_for_subscribers)
+                options.subscriptions,
+                options.wait_for_subscribers,
+            )
         return _publish(messages, publishers, options)
 
 
@@ -141,7 +151,8 @@ def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[reader.Topic]:
     for name in options.topics:
         if name not in there:
             raise MissingInputError(
-                f'the bag {options.bag} has no topic {name}; it has {", ".join(sorted(there))}')
+                f'the bag {options.bag} has no topic {name}; it has {", ".join(sorted(there))}'
+            )
     return [topic for topic in bag.topics if not options.topics or topic.name in options.topics]
 
 
@@ -149,11 +160,18 @@ def _publisher(node: Node, topic: reader.Topic, options: argparse.Namespace) -> 
     name, msgtype = topic.name, topic.msgtype
     if options.decode and msgtype == reader.COMPRESSED_IMAGE:
         name, msgtype = name.removesuffix('/compressed'), reader.IMAGE
-    reliability = (ReliabilityPolicy.BEST_EFFORT if options.best_effort
-                   else ReliabilityPolicy.RELIABLE)
-    return node.create_publisher(message_class(msgtype), name, QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=_DEPTH if msgtype == reader.IMU else 10,
-        reliability=reliability))
+    reliability = (
+        ReliabilityPolicy.BEST_EFFORT if options.best_effort else ReliabilityPolicy.RELIABLE
+    )
+    return node.create_publisher(
+        message_class(msgtype),
+        name,
+        QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=_DEPTH if msgtype == reader.IMU else 10,
+            reliability=reliability,
+        ),
+    )
 
 
 def _wait_for_subscribers(publishers: Sequence[Publisher], least: int, seconds: float) -> None:
@@ -167,14 +185,20 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], least: int, seconds: 
         time.sleep(0.02)
     if rclpy.ok():
         without = [topic for topic, count in counts.items() if not count]
-        raise MissingInputError((
-            f'nobody subscribed to {", ".join(without)}' if without else
-            f'{sum(counts.values())} of {least} subscriptions came') + f' within {seconds:g} s: '
-            'start the node first, and remap its topics to these names')
+        raise MissingInputError(
+            (
+                f'nobody subscribed to {", ".join(without)}'
+                if without
+                else f'{sum(counts.values())} of {least} subscriptions came'
+            )
+            + f' within {seconds:g} s: '
+            'start the node first, and remap its topics to these names'
+        )
 
 
-def _outgoing(bag: reader.Bag, topics: Sequence[reader.Topic],
-              options: argparse.Namespace) -> Iterator[Outgoing]:
+def _outgoing(
+    bag: reader.Bag, topics: Sequence[reader.Topic], options: argparse.Namespace
+) -> Iterator[Outgoing]:
     first_ns: int | None = None
     for raw in bag.raw_messages(topics):
         first_ns = raw.bag_time_ns if first_ns is None else first_ns
@@ -187,19 +211,26 @@ def _outgoing(bag: reader.Bag, topics: Sequence[reader.Topic],
 
 def _decoded(compressed: CompressedImage, encoding: str) -> Image:
     flags = cv2.IMREAD_GRAYSCALE if encoding == 'mono8' else cv2.IMREAD_COLOR
-    pixels = cv2.imdecode(np.frombuffer(compressed.data, np.uint8),
-                          flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    pixels = cv2.imdecode(
+        np.frombuffer(compressed.data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION
+    )
     if pixels is None:
         raise InputError('a compressed image of the bag cannot be decoded: it is corrupt')
     data = array('B')
     data.frombytes(pixels.tobytes())
     return Image(
-        header=compressed.header, height=pixels.shape[0], width=pixels.shape[1],
-        encoding=encoding, step=pixels.shape[1] * pixels[0, 0].size, data=data)
+        header=compressed.header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        step=pixels.shape[1] * pixels[0, 0].size,
+        data=data,
+    )
 
 
-def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
-             options: argparse.Namespace) -> int:
+def _publish(
+    messages: Iterator[Outgoing], publishers: dict[str, Publisher], options: argparse.Namespace
+) -> int:
     count = start_ns = 0
     log: list[tuple[bool, int, int, int]] = []
     for message in messages:
@@ -228,28 +259,59 @@ def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Options of a command line."""
     parser = argparse.ArgumentParser(
-        prog='player', description='Play a bag into the ROS graph at bag time.')
+        prog='player', description='Play a bag into the ROS graph at bag time.'
+    )
     parser.add_argument('bag', type=Path, help='rosbag2 directory, MCAP file or ROS 1 bag')
-    parser.add_argument('--best-effort', action='store_true',
-                        help='best-effort publishers instead of reliable ones')
-    parser.add_argument('--decode', choices=('mono8', 'bgr8'), default='',
-                        help='publish compressed images raw in this encoding, on the topic '
-                             'without /compressed')
-    parser.add_argument('--topics', nargs='+', default=(), metavar='TOPIC',
-                        help='only these topics of the bag')
-    parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
-                        help='longest wait for a subscription to each sensor topic; '
-                             '0 (default) starts at once')
-    parser.add_argument('--subscriptions', type=int, default=0, metavar='N',
-                        help='wait for so many to all sensor topics together, of several nodes')
-    parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
-                        help='repeat a recording whose motion has this period, without a seam: '
-                             'stamps continue from round to round; everything is decoded ahead')
-    parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
-                        help='with --loop: end after so many seconds (default: 60)')
-    parser.add_argument('--log', type=Path, metavar='FILE',
-                        help='with --loop: write the times at which each image and IMU message '
-                             'was due and published (NPY, LOG_DTYPE)')
+    parser.add_argument(
+        '--best-effort',
+        action='store_true',
+        help='best-effort publishers instead of reliable ones',
+    )
+    parser.add_argument(
+        '--decode',
+        choices=('mono8', 'bgr8'),
+        default='',
+        help='publish compressed images raw in this encoding, on the topic without /compressed',
+    )
+    parser.add_argument(
+        '--topics', nargs='+', default=(), metavar='TOPIC', help='only these topics of the bag'
+    )
+    parser.add_argument(
+        '--wait-for-subscribers',
+        type=float,
+        default=0.0,
+        metavar='SECONDS',
+        help='longest wait for a subscription to each sensor topic; 0 (default) starts at once',
+    )
+    parser.add_argument(
+        '--subscriptions',
+        type=int,
+        default=0,
+        metavar='N',
+        help='wait for so many to all sensor topics together, of several nodes',
+    )
+    parser.add_argument(
+        '--loop',
+        type=float,
+        default=0.0,
+        metavar='SECONDS',
+        help='repeat a recording whose motion has this period, without a seam: '
+        'stamps continue from round to round; everything is decoded ahead',
+    )
+    parser.add_argument(
+        '--duration',
+        type=float,
+        default=60.0,
+        metavar='SECONDS',
+        help='with --loop: end after so many seconds (default: 60)',
+    )
+    parser.add_argument(
+        '--log',
+        type=Path,
+        metavar='FILE',
+        help='with --loop: write the times at which each image and IMU message '
+        'was due and published (NPY, LOG_DTYPE)',
+    )
     given = parser.parse_args(arguments)
     if given.loop < 0.0 or given.duration <= 0.0:
         parser.error('--loop and --duration must be positive')

@@ -38,14 +38,21 @@ class Process:
         # A file, as a pipe without reader would block the process.
         self._log: BinaryIO = log.open('w+b') if log else tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
-            [sys.executable, *arguments], stdout=self._log, stderr=subprocess.STDOUT,
-            env={**os.environ, 'PYTHONUNBUFFERED': '1'})
+            [sys.executable, *arguments],
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
@@ -78,11 +85,13 @@ class Process:
 
     def wait_for(self, text: str) -> None:
         """Wait until it has written `text`."""
+
         def written() -> bool:
             ended = self._process.poll() is not None
             if ended and text not in self.output:
                 raise self._failure(f'ended before it wrote {text!r}')
             return text in self.output
+
         wait_until(written, f'{text!r} in the output of {self._name}')
 
     def signal(self, number: signal.Signals, *, every: float = _END_TIMEOUT) -> tuple[int, float]:
@@ -106,9 +115,14 @@ class Process:
         return LiveRunError(f'{self._name} {what}; the end of its output:\n{tail}')
 
 
-def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str] | None = None,
-                 parameters: Mapping[str, object] | None = None, log: Path | None = None,
-                 node: str = 'relpose_node') -> Process:
+def node_process(
+    parameter_file: Path | None = None,
+    *,
+    remap: Mapping[str, str] | None = None,
+    parameters: Mapping[str, object] | None = None,
+    log: Path | None = None,
+    node: str = 'relpose_node',
+) -> Process:
     """Start a node; `remap` takes topics, ``__ns`` and ``__node``."""
     words = [] if parameter_file is None else ['--params-file', str(parameter_file)]
     for name, value in (parameters or {}).items():
@@ -120,12 +134,20 @@ def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str]
 
 def player_process(bag: Path, *options: str, log: Path | None = None) -> Process:
     """Start a player of `bag`, which waits until the node subscribes."""
-    return Process('-m', 'rs_relpose_lab.live.player', str(bag), '--wait-for-subscribers',
-                   str(PATIENCE), *options, log=log)
+    return Process(
+        '-m',
+        'rs_relpose_lab.live.player',
+        str(bag),
+        '--wait-for-subscribers',
+        str(PATIENCE),
+        *options,
+        log=log,
+    )
 
 
-def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
-               timeout: float = PATIENCE) -> Value:
+def wait_until(
+    condition: Callable[[], Value], what: str, *processes: Process, timeout: float = PATIENCE
+) -> Value:
     """Poll until the value is true, and return it; LiveRunError where a process fails meanwhile.
 
     `what`: for the error message.
@@ -155,10 +177,10 @@ class ProcessMetrics:
     """Processor time and memory of a process at a time, from /proc."""
 
     time_ns: int
-    cpu: float   # [s] since its start, of all threads
-    cpu_main: float   # [s] of the first thread
-    resident: float   # [MB]
-    private: float   # [MB] without what is shared (the transport's segments)
+    cpu: float  # [s] since its start, of all threads
+    cpu_main: float  # [s] of the first thread
+    resident: float  # [MB]
+    private: float  # [MB] without what is shared (the transport's segments)
 
 
 def process_metrics(pid: int) -> ProcessMetrics:
@@ -169,9 +191,13 @@ def process_metrics(pid: int) -> ProcessMetrics:
     def megabytes(name: str) -> float:
         return int(memory[name].split()[0]) / 1024.0
 
-    return ProcessMetrics(time.monotonic_ns(), _cpu(folder / 'stat'),
-                          _cpu(folder / 'task' / str(pid) / 'stat'), megabytes('VmRSS'),
-                          megabytes('RssAnon'))
+    return ProcessMetrics(
+        time.monotonic_ns(),
+        _cpu(folder / 'stat'),
+        _cpu(folder / 'task' / str(pid) / 'stat'),
+        megabytes('VmRSS'),
+        megabytes('RssAnon'),
+    )
 
 
 def _cpu(path: Path) -> float:

@@ -28,9 +28,15 @@ from rs_relpose_ros.tracking.images import Pixels
 Entry = tuple[int, str, str, Any]
 
 
-def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 88,
-              raw: bool = False, on_frame: Callable[[], object] = lambda: None,
-              camera_info: bool = True) -> None:
+def write_bag(
+    simulation: Simulation,
+    path: Path | str,
+    *,
+    jpeg_quality: int = 88,
+    raw: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
+    camera_info: bool = True,
+) -> None:
     """Render `simulation` into a bag, in the order in which drivers would deliver.
 
     `path`: directory to create; `jpeg_quality`: 1 to 100; `raw`: sensor_msgs/Image instead.
@@ -41,18 +47,29 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
 
     def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
         if raw:
-            return reader.RAW_TOPIC, 'sensor_msgs/msg/Image', outgoing.image_message(
-                stamp_ns, reader.CAMERA_FRAME, Pixels(pixels, 'mono8'), bag.type)
-        return (reader.COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
-                outgoing.encoded_image_message(stamp_ns, reader.CAMERA_FRAME,
-                                               jpeg(pixels, jpeg_quality), bag.type))
+            return (
+                reader.RAW_TOPIC,
+                'sensor_msgs/msg/Image',
+                outgoing.image_message(
+                    stamp_ns, reader.CAMERA_FRAME, Pixels(pixels, 'mono8'), bag.type
+                ),
+            )
+        return (
+            reader.COMPRESSED_TOPIC,
+            'sensor_msgs/msg/CompressedImage',
+            outgoing.encoded_image_message(
+                stamp_ns, reader.CAMERA_FRAME, jpeg(pixels, jpeg_quality), bag.type
+            ),
+        )
 
     with BagWriter(path) as bag:
         images = image_entries(simulation, bag, encode, on_frame)
-        write_in_order(bag, (entry for entry in images
-                             if camera_info or entry[1] != reader.CAMERA_INFO_TOPIC),
-                       imu_entries(simulation, bag, reader.IMU_TOPIC),
-                       _truth_entries(simulation, bag))
+        write_in_order(
+            bag,
+            (entry for entry in images if camera_info or entry[1] != reader.CAMERA_INFO_TOPIC),
+            imu_entries(simulation, bag, reader.IMU_TOPIC),
+            _truth_entries(simulation, bag),
+        )
 
 
 def write_in_order(bag: BagWriter, *series: Iterator[Entry]) -> None:
@@ -61,13 +78,16 @@ def write_in_order(bag: BagWriter, *series: Iterator[Entry]) -> None:
         bag.write(topic, msgtype, message, bag_time_ns)
 
 
-def render_once(config: SimulationConfig, folder: Path,
-                trajectory: Trajectory | None = None) -> tuple[Path, Path]:
+def render_once(
+    config: SimulationConfig, folder: Path, trajectory: Trajectory | None = None
+) -> tuple[Path, Path]:
     """A bag and its parameter file in `folder`, rendered unless they exist."""
+
     def render(bag: Path, parameters: Path) -> None:
         simulation = simulate(config, trajectory=trajectory)
         write_bag(simulation, bag)
         write_parameters(simulation, parameters)
+
     return made_once(folder, 'bag', render)
 
 
@@ -87,16 +107,26 @@ def write_parameters(simulation: Simulation, path: Path, *, raw: bool = False) -
     """Write the parameter file of the node for the recording; `raw` as in `write_bag`."""
     values = {'image_transport': 'raw' if raw else 'compressed', **right_parameters(simulation)}
     parameter_file.write_parameters(
-        path, 'Parameters of relpose_node for the simulated bag of the same name.',
-        [SourcedValue(name, value, '') for name, value in values.items()])
+        path,
+        'Parameters of relpose_node for the simulated bag of the same name.',
+        [SourcedValue(name, value, '') for name, value in values.items()],
+    )
 
 
 def intrinsics_of(camera: RollingShutterCamera) -> Intrinsics:
     """Intrinsics of a camera as in the CameraInfo of its whole image."""
     return Intrinsics(
-        width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
-        cy=camera.cy, distortion_model=camera.distortion_model, distortion=camera.distortion,
-        image_width=camera.width, image_height=camera.height)
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion_model=camera.distortion_model,
+        distortion=camera.distortion,
+        image_width=camera.width,
+        image_height=camera.height,
+    )
 
 
 def right_parameters(simulation: Simulation) -> dict[str, Any]:
@@ -123,16 +153,20 @@ def jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
     return data.tobytes()
 
 
-def image_entries(simulation: Simulation, bag: BagWriter,
-                  encode: Callable[[int, NDArray[np.uint8]], tuple[str, str, Any]],
-                  on_frame: Callable[[], object]) -> Iterator[Entry]:
+def image_entries(
+    simulation: Simulation,
+    bag: BagWriter,
+    encode: Callable[[int, NDArray[np.uint8]], tuple[str, str, Any]],
+    on_frame: Callable[[], object],
+) -> Iterator[Entry]:
     """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
     delay_ns = to_nanoseconds(simulation.config.readout_time + reader.IMAGE_DELAY)
     for index in range(simulation.config.frame_count):
         stamp_ns = simulation.stamp_ns(index)
         topic, msgtype, message = encode(stamp_ns, simulation.image(index))
-        info = outgoing.camera_info_message(stamp_ns, reader.CAMERA_FRAME, simulation.camera,
-                                            None, bag.type)
+        info = outgoing.camera_info_message(
+            stamp_ns, reader.CAMERA_FRAME, simulation.camera, None, bag.type
+        )
         yield stamp_ns + delay_ns, reader.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         yield stamp_ns + delay_ns, topic, msgtype, message
         on_frame()
@@ -141,23 +175,41 @@ def image_entries(simulation: Simulation, bag: BagWriter,
 def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[Entry]:
     """IMU samples with their noise's variances."""
     config, imu = simulation.config, simulation.imu
-    gyro_covariance, accel_covariance = (density**2 * config.imu_rate * np.eye(3) for density in (
-        config.gyro_noise_density, config.accel_noise_density))
-    for stamp_ns, rate, force in zip(imu.stamps_ns.tolist(), imu.angular_velocities,
-                                     imu.linear_accelerations, strict=True):
-        yield (stamp_ns + to_nanoseconds(reader.IMU_DELAY), topic, 'sensor_msgs/msg/Imu',
-               outgoing.imu_message(stamp_ns, reader.IMU_FRAME, rate, force, bag.type,
-                                    angular_velocity_covariance=gyro_covariance,
-                                    linear_acceleration_covariance=accel_covariance))
+    gyro_covariance, accel_covariance = (
+        density**2 * config.imu_rate * np.eye(3)
+        for density in (config.gyro_noise_density, config.accel_noise_density)
+    )
+    for stamp_ns, rate, force in zip(
+        imu.stamps_ns.tolist(), imu.angular_velocities, imu.linear_accelerations, strict=True
+    ):
+        yield (
+            stamp_ns + to_nanoseconds(reader.IMU_DELAY),
+            topic,
+            'sensor_msgs/msg/Imu',
+            outgoing.imu_message(
+                stamp_ns,
+                reader.IMU_FRAME,
+                rate,
+                force,
+                bag.type,
+                angular_velocity_covariance=gyro_covariance,
+                linear_acceleration_covariance=accel_covariance,
+            ),
+        )
 
 
 def _truth_entries(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
     stamps_ns = simulation.imu.stamps_ns
     states = simulation.states(stamps_ns)
     quaternions = np.atleast_2d(Rotation.from_matrix(states.R_world_cam).as_quat())
-    for stamp_ns, position, quat_xyzw in zip(stamps_ns.tolist(), states.position, quaternions,
-                                             strict=True):
-        yield (stamp_ns + to_nanoseconds(reader.IMU_DELAY), reader.GROUND_TRUTH_TOPIC,
-               'geometry_msgs/msg/PoseStamped',
-               outgoing.pose_stamped_message(stamp_ns, reader.WORLD_FRAME, quat_xyzw, position,
-                                             bag.type))
+    for stamp_ns, position, quat_xyzw in zip(
+        stamps_ns.tolist(), states.position, quaternions, strict=True
+    ):
+        yield (
+            stamp_ns + to_nanoseconds(reader.IMU_DELAY),
+            reader.GROUND_TRUTH_TOPIC,
+            'geometry_msgs/msg/PoseStamped',
+            outgoing.pose_stamped_message(
+                stamp_ns, reader.WORLD_FRAME, quat_xyzw, position, bag.type
+            ),
+        )

@@ -26,9 +26,16 @@ _STEP_FREQUENCY = 1.8
 # Amplitude [deg], frequency [Hz] and axis (yaw, pitch, roll) of the rotation: looking around,
 # sway at the stride's frequency, nodding at the step's, tremor. Scaled as a whole to the rate.
 _ROTATIONS = (
-    (16.0, 0.31, 0), (5.0, 0.73, 0), (2.0, 0.9, 0), (0.35, 3.7, 0),
-    (4.0, 0.43, 1), (1.2, 1.8, 1), (0.30, 4.3, 1),
-    (3.0, 0.37, 2), (1.8, 0.9, 2), (0.35, 3.1, 2),
+    (16.0, 0.31, 0),
+    (5.0, 0.73, 0),
+    (2.0, 0.9, 0),
+    (0.35, 3.7, 0),
+    (4.0, 0.43, 1),
+    (1.2, 1.8, 1),
+    (0.30, 4.3, 1),
+    (3.0, 0.37, 2),
+    (1.8, 0.9, 2),
+    (0.35, 3.1, 2),
 )
 
 
@@ -51,7 +58,8 @@ class Plan:
             if kind not in KINDS or not 0.0 < seconds < math.inf:
                 raise InputError(
                     f'plan must be a list such as walk:1.5,still:0.6 of {", ".join(KINDS)} with '
-                    f'seconds > 0, got {item.strip()!r}')
+                    f'seconds > 0, got {item.strip()!r}'
+                )
             parts.append((kind, seconds))
         return cls(tuple(parts))
 
@@ -62,7 +70,7 @@ class Plan:
         total = -_TRANSITION
         while total < duration:
             pause = [('still', 0.52), ('rotate', 0.52)]
-            blocks = [[('constant', 0.75)], pause[::rng.choice((1, -1))]]
+            blocks = [[('constant', 0.75)], pause[:: rng.choice((1, -1))]]
             rng.shuffle(blocks)
             cycle = [('walk', 0.55), *blocks[0], ('walk', 0.55), *blocks[1], ('walk', 0.4)]
             parts += cycle
@@ -74,14 +82,21 @@ class Plan:
 class _Levels:
     """How much of each ingredient acts at every control point, 0 to 1."""
 
-    travel: Array     # moving along the heading
-    gait: Array       # changes of heading, speed and height
-    rotation: Array   # the sinusoids of the angles
-    panning: Array    # even rotation about the vertical
+    travel: Array  # moving along the heading
+    gait: Array  # changes of heading, speed and height
+    rotation: Array  # the sinusoids of the angles
+    panning: Array  # even rotation about the vertical
 
 
-def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *, speed: float,
-              rotation_rate: float) -> Trajectory:
+def hand_held(
+    rng: np.random.Generator,
+    start: float,
+    end: float,
+    plan: Plan,
+    *,
+    speed: float,
+    rotation_rate: float,
+) -> Trajectory:
     """Trajectory of `plan` from time 0, defined at least from `start` to `end` [s].
 
     What lies before time 0 continues the plan's first part, what lies after its end the last one.
@@ -92,9 +107,13 @@ def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *,
     times: Array = start - margin + CONTROL_SPACING * np.arange(count, dtype=np.float64)
     segments = _segments(plan)
     levels = _levels(times, segments)
-    return Trajectory(_walk(rng, times, levels, speed),
-                      _angles(rng, times, levels, rotation_rate),
-                      float(times[0]), CONTROL_SPACING, segments)
+    return Trajectory(
+        _walk(rng, times, levels, speed),
+        _angles(rng, times, levels, rotation_rate),
+        float(times[0]),
+        CONTROL_SPACING,
+        segments,
+    )
 
 
 def _segments(plan: Plan) -> tuple[Segment, ...]:
@@ -122,8 +141,12 @@ def _levels(times: Array, segments: tuple[Segment, ...]) -> _Levels:
         # The weights add up to 1 only nearly.
         return smooth.round(12)
 
-    return _Levels(travel=level(walk=1.0, constant=1.0), gait=level(walk=1.0),
-                   rotation=level(walk=1.0, rotate=1.0), panning=level(constant=1.0))
+    return _Levels(
+        travel=level(walk=1.0, constant=1.0),
+        gait=level(walk=1.0),
+        rotation=level(walk=1.0, rotate=1.0),
+        panning=level(constant=1.0),
+    )
 
 
 def _walk(rng: np.random.Generator, times: Array, levels: _Levels, speed: float) -> Array:
@@ -147,23 +170,33 @@ def _walk(rng: np.random.Generator, times: Array, levels: _Levels, speed: float)
             error = math.remainder(homewards - heading, 2 * math.pi)
             turn_rate = math.radians(110.0) * math.tanh(2.0 * error)
         heading += CONTROL_SPACING * gait * turn_rate
-        along = levels.travel[k] * speed * (
-            1.0 + 0.1 * gait * math.sin(2 * math.pi * 0.4 * time + swell))
+        along = (
+            levels.travel[k]
+            * speed
+            * (1.0 + 0.1 * gait * math.sin(2 * math.pi * 0.4 * time + swell))
+        )
         across = gait * 0.12 * math.cos(math.pi * _STEP_FREQUENCY * time + stride)
         # Two centimetres of bobbing, held near eye height.
-        climb = gait * (0.02 * 2 * math.pi * _STEP_FREQUENCY
-                        * math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
-                        + 0.8 * (EYE_HEIGHT - position[2]))
+        climb = gait * (
+            0.02
+            * 2
+            * math.pi
+            * _STEP_FREQUENCY
+            * math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
+            + 0.8 * (EYE_HEIGHT - position[2])
+        )
         cosine, sine = math.cos(heading), math.sin(heading)
         position = position + CONTROL_SPACING * np.array(
-            [along * cosine - across * sine, along * sine + across * cosine, climb])
+            [along * cosine - across * sine, along * sine + across * cosine, climb]
+        )
     # Clear of what stands around: the middle of the walk is the middle of the scene.
     positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
     return positions
 
 
-def _angles(rng: np.random.Generator, times: Array, levels: _Levels,
-            rotation_rate: float) -> Array:
+def _angles(
+    rng: np.random.Generator, times: Array, levels: _Levels, rotation_rate: float
+) -> Array:
     """Control points (K, 3) of yaw, pitch and roll."""
     amplitudes = np.array([amplitude for amplitude, _, _ in _ROTATIONS])
     amplitudes = np.radians(amplitudes * rng.uniform(0.7, 1.3, len(_ROTATIONS)))
@@ -176,7 +209,8 @@ def _angles(rng: np.random.Generator, times: Array, levels: _Levels,
     clock = CONTROL_SPACING * np.concatenate([[0.0], np.cumsum(levels.rotation[:-1])])
     angles = np.zeros((len(times), 3))
     for amplitude, frequency, phase, (_, _, axis) in zip(
-            amplitudes, frequencies, phases, _ROTATIONS, strict=True):
+        amplitudes, frequencies, phases, _ROTATIONS, strict=True
+    ):
         angles[:, axis] += amplitude * np.sin(2 * math.pi * frequency * clock + phase)
     # Pans to and fro, so that the view stays where the scene is.
     pan_rate = rng.choice((-1.0, 1.0)) * math.radians(rng.uniform(8.0, 15.0))
@@ -220,8 +254,9 @@ def vehicle(rng: np.random.Generator, start: float, end: float, *, speed: float)
     road = speeds / speed
     pitch, roll, heave = (_spring(rng.standard_normal(count) * road) for _ in range(3))
     positions[:, 2] += _HEAVE * heave
-    angles = np.column_stack([yaw, _ROCKING * pitch - _LEAN * acceleration,
-                              _ROCKING * roll + _LEAN * sideways])
+    angles = np.column_stack(
+        [yaw, _ROCKING * pitch - _LEAN * acceleration, _ROCKING * roll + _LEAN * sideways]
+    )
     angles[:, 1] += math.radians(rng.uniform(-1.0, 4.0))
     return Trajectory(positions, angles, float(times[0]), CONTROL_SPACING, ())
 
@@ -236,12 +271,15 @@ def _throttle(rng: np.random.Generator, times: Array) -> Array:
     return np.asarray(swell * stop)
 
 
-def _drive(rng: np.random.Generator, times: Array, speeds: Array,
-           full: float) -> tuple[Array, Array]:
+def _drive(
+    rng: np.random.Generator, times: Array, speeds: Array, full: float
+) -> tuple[Array, Array]:
     """Control points (K, 3) of the position and (K,) of the yaw."""
     phases = rng.uniform(0.0, 2 * math.pi, 2)
-    wander = _WANDER_RATE * (np.sin(2 * math.pi * 0.11 * times + phases[0])
-                             + np.sin(2 * math.pi * 0.29 * times + phases[1]))
+    wander = _WANDER_RATE * (
+        np.sin(2 * math.pi * 0.11 * times + phases[0])
+        + np.sin(2 * math.pi * 0.29 * times + phases[1])
+    )
     position = np.array([*rng.uniform(-1.0, 1.0, 2), _ROBOT_HEIGHT])
     heading, steering = rng.uniform(-math.pi, math.pi), 0.0
     positions, yaw = np.empty((len(times), 3)), np.empty(len(times))
@@ -250,13 +288,15 @@ def _drive(rng: np.random.Generator, times: Array, speeds: Array,
         wanted = wander[k]
         if math.hypot(position[0], position[1]) > _ARENA_RADIUS:
             homewards = math.atan2(-position[1], -position[0])
-            wanted = _HOMING_RATE * math.tanh(2.0 * math.remainder(homewards - heading,
-                                                                   2 * math.pi))
+            wanted = _HOMING_RATE * math.tanh(
+                2.0 * math.remainder(homewards - heading, 2 * math.pi)
+            )
         # The wheels need 0.4 s to turn, and a robot that stands does not.
         steering += CONTROL_SPACING / 0.4 * (wanted - steering)
         heading += CONTROL_SPACING * steering * driven / full
         position = position + CONTROL_SPACING * driven * np.array(
-            [math.cos(heading), math.sin(heading), 0.0])
+            [math.cos(heading), math.sin(heading), 0.0]
+        )
     positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
     return positions, yaw
 

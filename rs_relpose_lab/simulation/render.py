@@ -29,8 +29,9 @@ _NOTHING = 128.0
 
 # Nothing here lets the compiler fuse operations: the same image on every processor.
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath={'arcp', 'nsz'})
-_inline = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True,
-                     fastmath={'arcp', 'nsz'})
+_inline = numba.njit(
+    cache=True, nogil=True, error_model='numpy', forceinline=True, fastmath={'arcp', 'nsz'}
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,8 +45,8 @@ class Renderer:
     scene: Scene
     camera: RollingShutterCamera
     trajectory: Trajectory
-    edge_samples: int = 2   # squared, of pixels on the outline of a surface
-    exposure_time: float = 0.0   # [s] over which a row is averaged
+    edge_samples: int = 2  # squared, of pixels on the outline of a surface
+    exposure_time: float = 0.0  # [s] over which a row is averaged
     _rays: Array = field(init=False, repr=False)
     _tile_angles: Array = field(init=False, repr=False)
 
@@ -53,8 +54,10 @@ class Renderer:
         u, v = np.meshgrid(np.arange(self.camera.width), np.arange(self.camera.height))
         rays = self.camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1))
         if np.isnan(rays).any():
-            raise InputError('the distortion cannot be inverted over the whole image: choose '
-                             'weaker coefficients or a longer focal length')
+            raise InputError(
+                'the distortion cannot be inverted over the whole image: choose '
+                'weaker coefficients or a longer focal length'
+            )
         rays = rays.reshape(self.camera.height, self.camera.width, 3)
         object.__setattr__(self, '_rays', rays)
         object.__setattr__(self, '_tile_angles', _tile_angles(rays))
@@ -77,10 +80,13 @@ class Renderer:
         if not self.exposure_time:
             return 1
         (start, end), (R_start, R_end) = self.trajectory.poses(
-            reference_time + self.exposure_time * np.array([-0.5, 0.5]))
+            reference_time + self.exposure_time * np.array([-0.5, 0.5])
+        )
         corner = (self.camera.width - 1, self.camera.height - 1)
-        world, _ = self.locate(reference_time, np.stack(np.meshgrid(
-            *(np.linspace(0.0, last, 9) for last in corner)), axis=-1))
+        world, _ = self.locate(
+            reference_time,
+            np.stack(np.meshgrid(*(np.linspace(0.0, last, 9) for last in corner)), axis=-1),
+        )
         nearest = np.nanmin(np.linalg.norm(world - start, axis=1), initial=np.inf)
         angle = Rotation.from_matrix(R_start.T @ R_end).magnitude()
         motion = self.camera.fx * (angle + np.linalg.norm(end - start) / nearest)
@@ -90,8 +96,9 @@ class Renderer:
         """Image of rows that are exposed for no time."""
         rows = np.arange(self.camera.height)
         positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
-        exposure = _Exposure(self._rays, self._tile_angles, positions, rotations,
-                             1.0 / self.camera.fx)
+        exposure = _Exposure(
+            self._rays, self._tile_angles, positions, rotations, 1.0 / self.camera.fx
+        )
         shape = (self.camera.height, self.camera.width)
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
@@ -119,6 +126,7 @@ class Renderer:
 
         NaN for a point outside of the image, to the outer border of its pixels.
         """
+
         def motion(world: Array, times: Array) -> Array:
             positions, rotations = self.trajectory.poses(reference_time + times)
             return np.asarray(np.einsum('nji,nj->ni', rotations, world - positions))
@@ -130,8 +138,14 @@ class Renderer:
 def view_of(camera: RollingShutterCamera) -> View:
     """Projection and row times of the camera, for `rows.observe`."""
     line_delay = float(camera.row_times(1.0) - camera.row_times(0.0))
-    return View(camera.project, camera.unproject, camera.width, camera.height, line_delay,
-                camera.reference_row_index)
+    return View(
+        camera.project,
+        camera.unproject,
+        camera.width,
+        camera.height,
+        line_delay,
+        camera.reference_row_index,
+    )
 
 
 def _tile_angles(rays: Array) -> Array:
@@ -140,7 +154,7 @@ def _tile_angles(rays: Array) -> Array:
     starts = np.arange(0, width, _TILE)
     angles = np.empty((height, len(starts)))
     for i, start in enumerate(starts):
-        tile = rays[:, start:start + _TILE]
+        tile = rays[:, start : start + _TILE]
         middle = tile[:, tile.shape[1] // 2]
         cosine = np.einsum('hwi,hi->hw', tile, middle).min(axis=1)
         # A margin of two pixels for the samples around an outline.
@@ -152,18 +166,28 @@ def _tile_angles(rays: Array) -> Array:
 class _Exposure(NamedTuple):
     """Times and poses of the pixels."""
 
-    rays: Array   # (H, W, 3) in the camera frame
-    tile_angles: Array   # (H, tiles) [rad] as `_tile_angles` has them
-    positions: Array   # (H, 3) of the camera at each row
-    rotations: Array   # (H, 3, 3) likewise
-    pixel_angle: float   # [rad] in the middle of the image
+    rays: Array  # (H, W, 3) in the camera frame
+    tile_angles: Array  # (H, tiles) [rad] as `_tile_angles` has them
+    positions: Array  # (H, 3) of the camera at each row
+    rotations: Array  # (H, 3, 3) likewise
+    pixel_angle: float  # [rad] in the middle of the image
 
 
 # Columns of a face, a surface from one row's position: unit normal, height of the camera
 # above its plane; axes of its texture and the camera's own place along them; size; the surface's
 # index; direction and half angle of a cone around it.
 _NORMAL, _HEIGHT, _ACROSS, _A, _DOWN, _B, _SIZE, _INDEX, _TOWARDS, _ANGLE = (
-    0, 3, 4, 7, 8, 11, 12, 14, 15, 18)
+    0,
+    3,
+    4,
+    7,
+    8,
+    11,
+    12,
+    14,
+    15,
+    18,
+)
 _FACE_COLUMNS = 19
 
 
@@ -175,9 +199,11 @@ def _dot(x, y, z, faces, i, column):  # type: ignore[no-untyped-def]
 
 @_inline
 def _rotated(rotation, x, y, z):  # type: ignore[no-untyped-def]
-    return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-            rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-            rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
 
 
 @_jit
@@ -200,15 +226,25 @@ def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
             faces[i, _ACROSS + k] = across[s, k]
             faces[i, _DOWN + k] = down[s, k]
             faces[i, _TOWARDS + k] = (
-                corners[s, k] - position[k]
-                + 0.5 * (sizes[s, 0] * across[s, k] + sizes[s, 1] * down[s, k]))
+                corners[s, k]
+                - position[k]
+                + 0.5 * (sizes[s, 0] * across[s, k] + sizes[s, 1] * down[s, k])
+            )
         faces[i, _A] = _dot(x, y, z, faces, i, _ACROSS)
         faces[i, _B] = _dot(x, y, z, faces, i, _DOWN)
         faces[i, _SIZE] = sizes[s, 0]
         faces[i, _SIZE + 1] = sizes[s, 1]
         faces[i, _INDEX] = s
-        distance = math.sqrt(_dot(faces[i, _TOWARDS], faces[i, _TOWARDS + 1],
-                                  faces[i, _TOWARDS + 2], faces, i, _TOWARDS))
+        distance = math.sqrt(
+            _dot(
+                faces[i, _TOWARDS],
+                faces[i, _TOWARDS + 1],
+                faces[i, _TOWARDS + 2],
+                faces,
+                i,
+                _TOWARDS,
+            )
+        )
         radius = 0.5 * math.sqrt(sizes[s, 0] ** 2 + sizes[s, 1] ** 2)
         faces[i, _ANGLE] = math.asin(radius / distance) if radius < distance else math.pi
         for k in range(3):
@@ -307,11 +343,23 @@ def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, scene):  # type: igno
         along = (tap + 0.5) / taps - 0.5
         column = (a + along * da) / texel_a - 0.5
         row = (b + along * db) / texel_b - 0.5
-        value = _bilinear(scene.pixels, offsets[s, low], shapes[s, low, 0], shapes[s, low, 1],
-                          column * scale_low, row * scale_low)
+        value = _bilinear(
+            scene.pixels,
+            offsets[s, low],
+            shapes[s, low, 0],
+            shapes[s, low, 1],
+            column * scale_low,
+            row * scale_low,
+        )
         if mix > 0.0:
-            other = _bilinear(scene.pixels, offsets[s, high], shapes[s, high, 0],
-                              shapes[s, high, 1], column * scale_high, row * scale_high)
+            other = _bilinear(
+                scene.pixels,
+                offsets[s, high],
+                shapes[s, high, 0],
+                shapes[s, high, 1],
+                column * scale_high,
+                row * scale_high,
+            )
             value += mix * (other - value)
         total += value
     return total / taps
@@ -330,8 +378,14 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
         for tile in range(tile_angles.shape[1]):
             start = tile * _TILE
             end = min(start + _TILE, width)
-            count = _shortlist(rotation, rays[v, start + (end - start) // 2], tile_angles[v, tile],
-                               faces, face_count, chosen)
+            count = _shortlist(
+                rotation,
+                rays[v, start + (end - start) // 2],
+                tile_angles[v, tile],
+                faces,
+                face_count,
+                chosen,
+            )
             for u in range(start, end):
                 x, y, z = _rotated(rotation, rays[v, u, 0], rays[v, u, 1], rays[v, u, 2])
                 hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
@@ -340,8 +394,9 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
                     image[v, u] = _NOTHING
                 else:
                     hits[v, u] = int(faces[hit, _INDEX])
-                    image[v, u] = _shade(faces, hit, distance, a, b, x, y, z,
-                                         pixel_angle * rays[v, u, 2], scene)
+                    image[v, u] = _shade(
+                        faces, hit, distance, a, b, x, y, z, pixel_angle * rays[v, u, 2], scene
+                    )
 
 
 @_jit
@@ -363,8 +418,12 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
             left = max(u - 1, 0)
             right = min(u + 1, width - 1)
             here = hits[v, u]
-            if (hits[above, u] == here and hits[below, u] == here and hits[v, left] == here
-                    and hits[v, right] == here):
+            if (
+                hits[above, u] == here
+                and hits[below, u] == here
+                and hits[v, left] == here
+                and hits[v, right] == here
+            ):
                 continue
             if face_count < 0:
                 face_count = _find_faces(positions[v], scene, faces)
@@ -372,8 +431,14 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
             if tile != listed:
                 start = tile * _TILE
                 end = min(start + _TILE, width)
-                count = _shortlist(rotation, rays[v, start + (end - start) // 2],
-                                   tile_angles[v, tile], faces, face_count, chosen)
+                count = _shortlist(
+                    rotation,
+                    rays[v, start + (end - start) // 2],
+                    tile_angles[v, tile],
+                    faces,
+                    face_count,
+                    chosen,
+                )
                 listed = tile
             total = 0.0
             for i in range(samples):
@@ -381,15 +446,19 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
                 for j in range(samples):
                     du = ((j + 0.5) / samples - 0.5) / max(right - left, 1)
                     for k in range(3):
-                        ray[k] = (rays[v, u, k] + du * (rays[v, right, k] - rays[v, left, k])
-                                  + dv * (rays[below, u, k] - rays[above, u, k]))
+                        ray[k] = (
+                            rays[v, u, k]
+                            + du * (rays[v, right, k] - rays[v, left, k])
+                            + dv * (rays[below, u, k] - rays[above, u, k])
+                        )
                     x, y, z = _rotated(rotation, ray[0], ray[1], ray[2])
                     hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
                     if hit < 0:
                         total += _NOTHING
                     else:
-                        total += _shade(faces, hit, distance, a, b, x, y, z, pixel_angle * ray[2],
-                                        scene)
+                        total += _shade(
+                            faces, hit, distance, a, b, x, y, z, pixel_angle * ray[2], scene
+                        )
             image[v, u] = total / (samples * samples)
 
 

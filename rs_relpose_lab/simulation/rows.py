@@ -26,12 +26,12 @@ _LEAST_DEPTH = 0.1  # [m]
 class View:
     """Projection of a camera at rest, and its row times."""
 
-    project: Callable[[Array], Array]   # points (N, 3) to pixels (N, 2); NaN outside of the lens
-    unproject: Callable[[Array], Array]   # pixels (N, 2) to directions (N, 3) of any length
+    project: Callable[[Array], Array]  # points (N, 3) to pixels (N, 2); NaN outside of the lens
+    unproject: Callable[[Array], Array]  # pixels (N, 2) to directions (N, 3) of any length
     width: int
     height: int
-    line_delay: float   # from one row to the row below [s]
-    reference_row: float   # that is read at time 0
+    line_delay: float  # from one row to the row below [s]
+    reference_row: float  # that is read at time 0
 
 
 def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: Array) -> Motion:
@@ -39,9 +39,11 @@ def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: A
 
     ``x(t) = Exp(-t w) (R_0^T (X - p_0) - t v)``
     """
+
     def to_camera(world: Array, times: Array) -> Array:
         moved = attitude.inv().apply(world - position) - times[:, None] * velocity
         return np.asarray(Rotation.from_rotvec(-times[:, None] * rate).apply(moved))
+
     return to_camera
 
 
@@ -56,6 +58,7 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
     Returns pixels; NaN for a point outside of the image or nearer than 0.1 m, and for one that
         crosses the rows as fast as they are read, whose row is not unique.
     """
+
     def project(which: NDArray[np.intp], rows: Array) -> Array:
         local = motion(world[which], (rows - view.reference_row) * view.line_delay)
         with np.errstate(divide='ignore', invalid='ignore'):
@@ -81,19 +84,27 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
         settled = np.abs(pixels[:, 1] - rows) < _SETTLED_ROWS
         observed[left[settled & slow]] = pixels[settled & slow]
         # From the last of those rows it is still further outside: it appears in no row.
-        beyond = ((rows <= -view.height) & (pixels[:, 1] < rows)
-                  | (rows >= 2 * view.height) & (pixels[:, 1] > rows))
+        beyond = (rows <= -view.height) & (pixels[:, 1] < rows) | (rows >= 2 * view.height) & (
+            pixels[:, 1] > rows
+        )
         again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
         left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
         rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
-    inside = ((observed >= -margin)
-              & (observed <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
+    inside = (
+        (observed >= -margin) & (observed <= np.array([view.width - 1, view.height - 1]) + margin)
+    ).all(axis=1)
     observed[~inside] = np.nan
     return observed
 
 
-def in_front(view: View, attitude: Rotation, position: Array, count: int,
-             depths: tuple[float, float], rng: np.random.Generator) -> Array:
+def in_front(
+    view: View,
+    attitude: Rotation,
+    position: Array,
+    count: int,
+    depths: tuple[float, float],
+    rng: np.random.Generator,
+) -> Array:
     """World points (count, 3) spread evenly over the image of a camera at rest.
 
     `depths` [m]: range from which each point's depth is drawn.
@@ -104,8 +115,9 @@ def in_front(view: View, attitude: Rotation, position: Array, count: int,
     return np.asarray(attitude.apply(depth * rays / rays[:, 2:]) + position)
 
 
-def in_both_views(candidates: Callable[[], Array], motion1: Motion, motion2: Motion, view: View,
-                  count: int) -> tuple[Array, Array]:
+def in_both_views(
+    candidates: Callable[[], Array], motion1: Motion, motion2: Motion, view: View, count: int
+) -> tuple[Array, Array]:
     """Pixels (count, 2) in each of two cameras of the first `candidates` inside both images."""
     most = 1_000_000
     pixels = np.empty((0, 4))
@@ -120,12 +132,18 @@ def in_both_views(candidates: Callable[[], Array], motion1: Motion, motion2: Mot
     return pixels[:count, :2], pixels[:count, 2:]
 
 
-def measured(points: tuple[Array, Array], view: View, sigma: float, outliers: float,
-             rng: np.random.Generator) -> tuple[Array, Array, NDArray[np.bool_]]:
+def measured(
+    points: tuple[Array, Array],
+    view: View,
+    sigma: float,
+    outliers: float,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Matches with noise, 1 sigma of each coordinate [px], and which of them are random."""
     points1, points2 = (exact + sigma * rng.standard_normal(exact.shape) for exact in points)
     is_outlier = np.zeros(len(points1), dtype=bool)
-    is_outlier[rng.permutation(len(points1))[:round(outliers * len(points1))]] = True
-    points2[is_outlier] = rng.uniform(0.0, [view.width - 1, view.height - 1],
-                                      (int(is_outlier.sum()), 2))
+    is_outlier[rng.permutation(len(points1))[: round(outliers * len(points1))]] = True
+    points2[is_outlier] = rng.uniform(
+        0.0, [view.width - 1, view.height - 1], (int(is_outlier.sum()), 2)
+    )
     return points1, points2, is_outlier

@@ -25,8 +25,9 @@ _SMALLEST_SHAPE = 5.0
 _SMALLEST_PANEL = 14
 
 
-def make_texture(rng: np.random.Generator, shape: tuple[int, int], *,
-                 contrast: float = 1.0) -> NDArray[np.uint8]:
+def make_texture(
+    rng: np.random.Generator, shape: tuple[int, int], *, contrast: float = 1.0
+) -> NDArray[np.uint8]:
     """Gray texture (H, W): panels, a pile of random shapes, band-limited octaves of noise.
 
     Shapes of all sizes that cover one another have the statistics of natural images; corners suit
@@ -52,9 +53,10 @@ def _noise(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float
         spacing = wavelength / 2
         rows, columns = (math.ceil(size / spacing) + 4 for size in shape)
         grid = rng.standard_normal((rows, columns), dtype=np.float32)
-        octave = cv2.resize(grid, (round(columns * spacing), round(rows * spacing)),
-                            interpolation=cv2.INTER_CUBIC)
-        total += np.float32(strength) * octave[:shape[0], :shape[1]]
+        octave = cv2.resize(
+            grid, (round(columns * spacing), round(rows * spacing)), interpolation=cv2.INTER_CUBIC
+        )
+        total += np.float32(strength) * octave[: shape[0], : shape[1]]
         power += strength**2
         strength *= 1.5
         wavelength *= 2.0
@@ -71,13 +73,14 @@ def _draw_panels(rng: np.random.Generator, canvas: NDArray[np.uint8], *, amplitu
         longer = max(w, h)
         # Large panels are always divided, small ones seldom.
         keep = longer < 2 * _SMALLEST_PANEL or (
-            longer < 0.45 * max(width, height) and rng.random() < 0.25)
+            longer < 0.45 * max(width, height) and rng.random() < 0.25
+        )
         if keep:
             gray = int(128 + rng.integers(-amplitude, amplitude + 1))
-            canvas[y:y + h, x:x + w] = gray
+            canvas[y : y + h, x : x + w] = gray
             joint = 1 + min(w, h) // 40
-            canvas[y:y + joint, x:x + w] = max(gray - 50, 0)
-            canvas[y:y + h, x:x + joint] = max(gray - 50, 0)
+            canvas[y : y + joint, x : x + w] = max(gray - 50, 0)
+            canvas[y : y + h, x : x + joint] = max(gray - 50, 0)
             continue
         cut = round(longer * rng.uniform(0.3, 0.7))
         if w >= h:
@@ -107,18 +110,30 @@ def _draw_shapes(rng: np.random.Generator, canvas: NDArray[np.uint8], *, density
     around = 2 * math.pi * (np.arange(4) + skews) / corners[:, None]
     x = 0.6 * sizes[:, None] * np.cos(around)
     y = 0.6 * (sizes * aspects)[:, None] * np.sin(around)
-    outlines = np.stack([cosines[:, None] * x - sines[:, None] * y,
-                         sines[:, None] * x + cosines[:, None] * y], axis=2)
+    outlines = np.stack(
+        [cosines[:, None] * x - sines[:, None] * y, sines[:, None] * x + cosines[:, None] * y],
+        axis=2,
+    )
     polygons = _fixed(outlines + centres[:, None])
     middles = _fixed(centres).tolist()
     axes = _fixed(0.5 * sizes[:, None] * np.stack([np.ones(count), aspects], axis=1)).tolist()
     degrees = np.degrees(angles).tolist()
     for i in range(count):
         if kinds[i] == 0:
-            cv2.ellipse(canvas, middles[i], axes[i], degrees[i], 0.0, 360.0, grays[i], -1,
-                        cv2.LINE_AA, _SHIFT)
+            cv2.ellipse(
+                canvas,
+                middles[i],
+                axes[i],
+                degrees[i],
+                0.0,
+                360.0,
+                grays[i],
+                -1,
+                cv2.LINE_AA,
+                _SHIFT,
+            )
         else:
-            cv2.fillConvexPoly(canvas, polygons[i, :corners[i]], grays[i], cv2.LINE_AA, _SHIFT)
+            cv2.fillConvexPoly(canvas, polygons[i, : corners[i]], grays[i], cv2.LINE_AA, _SHIFT)
 
 
 # Fractional bits of OpenCV's drawing coordinates.
@@ -145,11 +160,11 @@ _ROOT = np.array([0.0, 0.0, 1.6])
 class Surface:
     """A textured rectangle, visible from the side opposite to ``across x down``."""
 
-    corner: Array   # [m] world position of the texture's upper left, as its viewer sees it
-    across: Array   # unit vector along the texture's rows
-    down: Array   # and along its columns
-    width: float   # [m]
-    height: float   # [m]
+    corner: Array  # [m] world position of the texture's upper left, as its viewer sees it
+    across: Array  # unit vector along the texture's rows
+    down: Array  # and along its columns
+    width: float  # [m]
+    height: float  # [m]
     # (H, W), texel (i, j) centred at ((j + 0.5) width / W, (i + 0.5) height / H).
     texture: NDArray[np.uint8]
 
@@ -161,15 +176,15 @@ class Scene(NamedTuple):
     texel k is where level 0 has ``2^l k``.
     """
 
-    corners: Array   # (S, 3) as of `Surface`, likewise
+    corners: Array  # (S, 3) as of `Surface`, likewise
     across: Array
     down: Array
-    sizes: Array   # (S, 2) [m]
-    texels: Array   # (S, 2) size of a texel of level 0 [m]
+    sizes: Array  # (S, 2) [m]
+    texels: Array  # (S, 2) size of a texel of level 0 [m]
     pixels: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     shapes: NDArray[np.int64]
-    levels: NDArray[np.int64]   # (S,) of each texture
+    levels: NDArray[np.int64]  # (S,) of each texture
 
     @classmethod
     def of(cls, *surfaces: Surface) -> Scene:
@@ -184,11 +199,22 @@ class Scene(NamedTuple):
                 offsets[s, level], shapes[s, level] = total, texture.shape
                 total += texture.size
         sizes = np.array([[s.width, s.height] for s in surfaces])
-        corners, across, down = (np.array([getattr(s, name) for s in surfaces], dtype=np.float64)
-                                 for name in ('corner', 'across', 'down'))
+        corners, across, down = (
+            np.array([getattr(s, name) for s in surfaces], dtype=np.float64)
+            for name in ('corner', 'across', 'down')
+        )
         pixels = np.concatenate([texture.ravel() for pyramid in pyramids for texture in pyramid])
-        return cls(corners, across, down, sizes, sizes / shapes[:, 0, ::-1], pixels, offsets,
-                   shapes, levels)
+        return cls(
+            corners,
+            across,
+            down,
+            sizes,
+            sizes / shapes[:, 0, ::-1],
+            pixels,
+            offsets,
+            shapes,
+            levels,
+        )
 
 
 def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scene:
@@ -226,7 +252,8 @@ def _yard(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | Non
         width = rng.uniform(3.5, 6.0)
         x, height = rng.uniform(7.5, 13.0), rng.uniform(4.0, 8.0)
         yield from builder.box(
-            (x + 1.5, border + width / 2, height / 2), (3.0, width, height), 0.0)
+            (x + 1.5, border + width / 2, height / 2), (3.0, width, height), 0.0
+        )
         border += width
     for side in (-1.0, 1.0):
         yield from builder.box((2.0, side * rng.uniform(9.0, 10.5), 1.5), (18.0, 0.3, 3.0), 0.0)
@@ -251,8 +278,9 @@ def _gallery(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | 
     yield from _crates(builder, rng, count=5, reach=length - 2.0)
 
 
-def _crates(builder: _Builder, rng: np.random.Generator, *, count: int,
-            reach: float) -> Iterator[Surface | None]:
+def _crates(
+    builder: _Builder, rng: np.random.Generator, *, count: int, reach: float
+) -> Iterator[Surface | None]:
     for _ in range(count):
         x, y = _place(rng, 5.2, reach)
         size = rng.uniform((0.5, 0.5, 0.5), (1.4, 1.6, 2.2))
@@ -273,9 +301,16 @@ class _Builder:
         self._rng = rng
         self._focal_length = focal_length
 
-    def surface(self, corner: ArrayLike, across: ArrayLike, down: ArrayLike, width: float,
-                height: float, contrast: float = 1.0,
-                nearest: float = _NEAREST) -> Surface | None:
+    def surface(
+        self,
+        corner: ArrayLike,
+        across: ArrayLike,
+        down: ArrayLike,
+        width: float,
+        height: float,
+        contrast: float = 1.0,
+        nearest: float = _NEAREST,
+    ) -> Surface | None:
         """A rectangle, at least `nearest` [m] away; None if it is never visible."""
         corner, across, down = (np.asarray(v, dtype=np.float64) for v in (corner, across, down))
         normal = np.cross(down, across)
@@ -284,11 +319,13 @@ class _Builder:
         distance = max(_distance(corner, across, down, width, height), nearest)
         texel = _TEXELS_PER_FOOTPRINT / self._focal_length * distance
         shape = (max(4, math.ceil(height / texel)), max(4, math.ceil(width / texel)))
-        return Surface(corner, across, down, width, height,
-                       make_texture(self._rng, shape, contrast=contrast))
+        return Surface(
+            corner, across, down, width, height, make_texture(self._rng, shape, contrast=contrast)
+        )
 
-    def room(self, x0: float, x1: float, y0: float, y1: float,
-             height: float) -> Iterator[Surface | None]:
+    def room(
+        self, x0: float, x1: float, y0: float, y1: float, height: float
+    ) -> Iterator[Surface | None]:
         """Floor, ceiling and four walls, from inside."""
         yield self.floor(x0, x1, y0, y1)
         yield self.surface((x0, y1, height), (0, -1, 0), (1, 0, 0), y1 - y0, x1 - x0, 0.6)
@@ -299,21 +336,28 @@ class _Builder:
 
     def floor(self, x0: float, x1: float, y0: float, y1: float) -> Surface | None:
         """The ground, viewed at a slant."""
-        return self.surface((x1, y1, 0), (0, -1, 0), (-1, 0, 0), y1 - y0, x1 - x0,
-                            nearest=_FLOOR_DISTANCE)
+        return self.surface(
+            (x1, y1, 0), (0, -1, 0), (-1, 0, 0), y1 - y0, x1 - x0, nearest=_FLOOR_DISTANCE
+        )
 
     def sky(self, distance: float) -> Iterator[Surface | None]:
         """Clouds around and above, in low contrast."""
         d = distance
-        for along, to_left in (((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (-1, 0, 0)),
-                               ((-1, 0, 0), (0, -1, 0)), ((0, -1, 0), (1, 0, 0))):
+        for along, to_left in (
+            ((1, 0, 0), (0, 1, 0)),
+            ((0, 1, 0), (-1, 0, 0)),
+            ((-1, 0, 0), (0, -1, 0)),
+            ((0, -1, 0), (1, 0, 0)),
+        ):
             ahead, left = np.array(along, dtype=float), np.array(to_left, dtype=float)
-            yield self.surface(d * ahead + d * left + (0, 0, 20.0), -left, (0, 0, -1), 2 * d, 30.0,
-                               0.3)
+            yield self.surface(
+                d * ahead + d * left + (0, 0, 20.0), -left, (0, 0, -1), 2 * d, 30.0, 0.3
+            )
         yield self.surface((-d, d, 20.0), (0, -1, 0), (1, 0, 0), 2 * d, 2 * d, 0.3)
 
-    def box(self, centre: tuple[float, float, float], size: tuple[float, ...],
-            yaw: float) -> Iterator[Surface | None]:
+    def box(
+        self, centre: tuple[float, float, float], size: tuple[float, ...], yaw: float
+    ) -> Iterator[Surface | None]:
         """Four sides and the top; `size` along x, y, z before rotation by `yaw` [rad]."""
         cosine, sine = math.cos(yaw), math.sin(yaw)
         forward = np.array([cosine, sine, 0.0])
@@ -322,12 +366,20 @@ class _Builder:
         middle = np.array(centre)
         half = np.array(size) / 2
         for outward, right, depth, breadth in (
-                (forward, left, half[0], half[1]), (-forward, -left, half[0], half[1]),
-                (left, -forward, half[1], half[0]), (-left, forward, half[1], half[0])):
+            (forward, left, half[0], half[1]),
+            (-forward, -left, half[0], half[1]),
+            (left, -forward, half[1], half[0]),
+            (-left, forward, half[1], half[0]),
+        ):
             corner = middle + depth * outward - breadth * right + half[2] * up
             yield self.surface(corner, right, -up, 2 * breadth, 2 * half[2])
-        yield self.surface(middle + half[0] * forward + half[1] * left + half[2] * up, -left,
-                           -forward, 2 * half[1], 2 * half[0])
+        yield self.surface(
+            middle + half[0] * forward + half[1] * left + half[2] * up,
+            -left,
+            -forward,
+            2 * half[1],
+            2 * half[0],
+        )
 
 
 def _distance(corner: Array, across: Array, down: Array, width: float, height: float) -> float:

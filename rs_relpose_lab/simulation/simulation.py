@@ -24,11 +24,11 @@ class ImuModel:
     """An IMU fixed to the camera: mounting, biases and noise; ``v_cam = R_cam_imu v_imu``."""
 
     R_cam_imu: Array
-    lever_arm: ArrayLike = (0.0, 0.0, 0.0)   # position of the IMU in the camera frame [m]
-    gyro_bias: ArrayLike = (0.0, 0.0, 0.0)   # [rad/s] added to the truth, IMU frame
-    accel_bias: ArrayLike = (0.0, 0.0, 0.0)   # [m/s^2] likewise
-    gyro_sigma: float = 0.0   # of a sample: density times the square root of the rate
-    accel_sigma: float = 0.0   # likewise
+    lever_arm: ArrayLike = (0.0, 0.0, 0.0)  # position of the IMU in the camera frame [m]
+    gyro_bias: ArrayLike = (0.0, 0.0, 0.0)  # [rad/s] added to the truth, IMU frame
+    accel_bias: ArrayLike = (0.0, 0.0, 0.0)  # [m/s^2] likewise
+    gyro_sigma: float = 0.0  # of a sample: density times the square root of the rate
+    accel_sigma: float = 0.0  # likewise
 
     def measure(self, states: CameraStates, rng: np.random.Generator) -> tuple[Array, Array]:
         """Measured angular velocities and specific forces (N, 3) in the IMU frame.
@@ -39,8 +39,9 @@ class ImuModel:
         lever = np.broadcast_to(np.asarray(self.lever_arm, dtype=np.float64), w.shape)
         # a_imu = a + R (dw x l + w x (w x l)), the rigid body's other point.
         rotation = np.cross(dw, lever) + np.cross(w, np.cross(w, lever))
-        force = (np.einsum('nji,nj->ni', states.R_world_cam, states.acceleration - GRAVITY)
-                 + rotation)
+        force = (
+            np.einsum('nji,nj->ni', states.R_world_cam, states.acceleration - GRAVITY) + rotation
+        )
         gyro = w @ self.R_cam_imu + np.asarray(self.gyro_bias)
         accel = force @ self.R_cam_imu + np.asarray(self.accel_bias)
         gyro = gyro + self.gyro_sigma * rng.standard_normal(gyro.shape)
@@ -66,9 +67,15 @@ class ImuSeries:
 
     def samples(self) -> list[ImuSample]:
         """The same as messages."""
-        return [ImuSample(stamp, tuple(rate), tuple(force)) for stamp, rate, force in zip(
-            self.stamps_ns.tolist(), self.angular_velocities.tolist(),
-            self.linear_accelerations.tolist(), strict=True)]
+        return [
+            ImuSample(stamp, tuple(rate), tuple(force))
+            for stamp, rate, force in zip(
+                self.stamps_ns.tolist(),
+                self.angular_velocities.tolist(),
+                self.linear_accelerations.tolist(),
+                strict=True,
+            )
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +102,8 @@ class Simulation:
         gray = self.renderer.render(self.seconds(self.reference_ns(index)))
         rng = _stream(self.config.seed, _IMAGE, index)
         gray = gray + np.float32(self.config.pixel_noise) * rng.standard_normal(
-            gray.shape, dtype=np.float32)
+            gray.shape, dtype=np.float32
+        )
         return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
 
     def seconds(self, time_ns: int) -> float:
@@ -122,9 +130,13 @@ class Simulation:
         return points2
 
 
-def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = None,
-             trajectory: Trajectory | None = None,
-             camera: RollingShutterCamera | None = None) -> Simulation:
+def simulate(
+    config: SimulationConfig | None = None,
+    *,
+    scene: Scene | None = None,
+    trajectory: Trajectory | None = None,
+    camera: RollingShutterCamera | None = None,
+) -> Simulation:
     """Set up a recording; `scene`, `trajectory`, `camera`: instead of the configuration's."""
     config = SimulationConfig() if config is None else config
     camera = config.camera if camera is None else camera
@@ -136,24 +148,39 @@ def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = No
         plan = Plan.parse(config.plan) if config.plan else Plan.drawn(rng, config.duration)
         speed, rotation_rate = rng.uniform(1.5, 1.8), math.radians(rng.uniform(25.0, 45.0))
         # Wider than any camera needs: the motion must not depend on readout or stamped row.
-        trajectory = hand_held(rng, -_MOTION_MARGIN, config.duration + _MOTION_MARGIN, plan,
-                               speed=config.speed or speed,
-                               rotation_rate=config.rotation_rate or rotation_rate)
+        trajectory = hand_held(
+            rng,
+            -_MOTION_MARGIN,
+            config.duration + _MOTION_MARGIN,
+            plan,
+            speed=config.speed or speed,
+            rotation_rate=config.rotation_rate or rotation_rate,
+        )
     if scene is None:
         scene = make_scene(config.scene, _stream(config.seed, _SCENE), config.fx)
     renderer = Renderer(scene, camera, trajectory, config.edge_samples, config.exposure_time)
     model = ImuModel(
-        config.R_cam_imu, config.lever_arm, config.gyro_bias, config.accel_bias,
+        config.R_cam_imu,
+        config.lever_arm,
+        config.gyro_bias,
+        config.accel_bias,
         config.gyro_noise_density * math.sqrt(config.imu_rate),
-        config.accel_noise_density * math.sqrt(config.imu_rate))
-    samples = np.arange(math.ceil(-before * config.imu_rate),
-                        math.floor(after * config.imu_rate) + 1)
+        config.accel_noise_density * math.sqrt(config.imu_rate),
+    )
+    samples = np.arange(
+        math.ceil(-before * config.imu_rate), math.floor(after * config.imu_rate) + 1
+    )
     offsets_ns = np.rint(samples * (1e9 / config.imu_rate)).astype(np.int64)
     gyro, accel = model.measure(trajectory.states(offsets_ns * 1e-9), _stream(config.seed, _IMU))
     bias_error = config.gyro_bias_error * _stream(config.seed, _BIAS).standard_normal(3)
-    return Simulation(config, camera, trajectory, renderer,
-                      ImuSeries(config.start_ns + offsets_ns, gyro, accel),
-                      np.array(config.gyro_bias) + bias_error)
+    return Simulation(
+        config,
+        camera,
+        trajectory,
+        renderer,
+        ImuSeries(config.start_ns + offsets_ns, gyro, accel),
+        np.array(config.gyro_bias) + bias_error,
+    )
 
 
 def _stream(seed: int, *key: int) -> np.random.Generator:

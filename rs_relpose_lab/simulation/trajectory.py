@@ -31,7 +31,7 @@ R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 class Segment:
     """A stretch of one kind of motion, in seconds of the trajectory."""
 
-    kind: str   # 'walk', 'constant' velocities, 'still' or 'rotate' about the camera centre
+    kind: str  # 'walk', 'constant' velocities, 'still' or 'rotate' about the camera centre
     start: float
     end: float
 
@@ -40,11 +40,11 @@ class Segment:
 class CameraStates:
     """Poses of the camera optical frame in the world at N times, and their derivatives."""
 
-    position: Array   # (N, 3) world frame [m], [m/s], [m/s^2]
+    position: Array  # (N, 3) world frame [m], [m/s], [m/s^2]
     R_world_cam: Array
     velocity: Array
     acceleration: Array
-    angular_velocity: Array   # (N, 3) camera frame [rad/s], [rad/s^2]
+    angular_velocity: Array  # (N, 3) camera frame [rad/s], [rad/s^2]
     angular_acceleration: Array
 
 
@@ -52,10 +52,10 @@ class CameraStates:
 class Trajectory:
     """Motion of the camera over an interval; angles are yaw, pitch and roll."""
 
-    positions: Array   # (K, 3) [m] of control points
-    angles: Array   # (K, 3) [rad] likewise
-    first_control: float   # [s]
-    spacing: float   # [s]
+    positions: Array  # (K, 3) [m] of control points
+    angles: Array  # (K, 3) [rad] likewise
+    first_control: float  # [s]
+    spacing: float  # [s]
     # Labels of the stretches; between them one kind passes into the next.
     segments: tuple[Segment, ...] = ()
     _spline: BSpline = field(init=False, repr=False)
@@ -63,7 +63,8 @@ class Trajectory:
     def __post_init__(self) -> None:
         count = len(self.positions)
         knots = self.first_control + self.spacing * (
-            np.arange(count + DEGREE + 1) - (DEGREE + 1) / 2)
+            np.arange(count + DEGREE + 1) - (DEGREE + 1) / 2
+        )
         controls = np.hstack([self.positions, self.angles])
         object.__setattr__(self, '_spline', BSpline(knots, controls, DEGREE, extrapolate=False))
 
@@ -83,17 +84,23 @@ class Trajectory:
         value, first, second = (self._evaluate(times, order) for order in range(3))
         rate, rate_change = _body_rates(value[:, 3:], first[:, 3:], second[:, 3:])
         return CameraStates(
-            position=value[:, :3], R_world_cam=_orientation(value[:, 3:]),
-            velocity=first[:, :3], acceleration=second[:, :3],
-            angular_velocity=rate @ R_BODY_CAM, angular_acceleration=rate_change @ R_BODY_CAM)
+            position=value[:, :3],
+            R_world_cam=_orientation(value[:, 3:]),
+            velocity=first[:, :3],
+            acceleration=second[:, :3],
+            angular_velocity=rate @ R_BODY_CAM,
+            angular_acceleration=rate_change @ R_BODY_CAM,
+        )
 
     def _evaluate(self, times: ArrayLike, order: int) -> Array:
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
         values: Array = self._spline(times, order)
         if np.isnan(values).any():
             first, last = self.span
-            raise InputError(f'the trajectory is defined from {first:.3f} to {last:.3f} s, '
-                             f'requested from {times.min():.3f} to {times.max():.3f} s')
+            raise InputError(
+                f'the trajectory is defined from {first:.3f} to {last:.3f} s, '
+                f'requested from {times.min():.3f} to {times.max():.3f} s'
+            )
         return values
 
 
@@ -114,14 +121,19 @@ def _body_rates(angles: Array, first: Array, second: Array) -> tuple[Array, Arra
     ddy, ddp, ddr = second.T
     sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
     rate = np.stack([dr - dy * sp, dp * cr + dy * sr * cp, -dp * sr + dy * cr * cp], axis=1)
-    change = np.stack([
-        ddr - ddy * sp - dy * cp * dp,
-        ddp * cr - dp * sr * dr + ddy * sr * cp + dy * (cr * cp * dr - sr * sp * dp),
-        -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * (sr * cp * dr + cr * sp * dp)], axis=1)
+    change = np.stack(
+        [
+            ddr - ddy * sp - dy * cp * dp,
+            ddp * cr - dp * sr * dr + ddy * sr * cp + dy * (cr * cp * dr - sr * sp * dp),
+            -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * (sr * cp * dr + cr * sp * dp),
+        ],
+        axis=1,
+    )
     return rate, change
 
 
 # -- a trajectory on a fine grid: poses at many times, in a fraction of the spline's time ------
+
 
 class FinePath:
     """Poses of a trajectory from `begin` to `end` [s], linear between steps of a millisecond."""
@@ -133,10 +145,12 @@ class FinePath:
         times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
         self.positions, self.rotations = trajectory.poses(times)
         self.steps = Rotation.from_matrix(
-            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
+            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])
+        ).as_rotvec()
 
     def motion_from(self, reference: float) -> Motion:
         """Motion of a frame, whose times count from the time of its reference row [s]."""
+
         def to_camera(points: Array, times: Array) -> Array:
             at = (reference + times - self.begin) / self.step
             k = np.clip(at.astype(int), 0, len(self.steps) - 1)
@@ -145,4 +159,5 @@ class FinePath:
             rotated = np.einsum('nji,nj->ni', self.rotations[k], points - position)
             # Of 1e-3 rad: exact to 1e-6.
             return np.asarray(rotated - share * np.cross(self.steps[k], rotated))
+
         return to_camera

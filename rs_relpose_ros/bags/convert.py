@@ -51,8 +51,8 @@ class RecordedImage:
     """A JPEG image of a recording, with its stamp [ns] by the camera's clock."""
 
     stamp_ns: int
-    name: str   # in errors
-    encoded: Callable[[], bytes]   # reads the JPEG data
+    name: str  # in errors
+    encoded: Callable[[], bytes]  # reads the JPEG data
 
 
 def image_file(stamp_ns: int, path: Path) -> RecordedImage:
@@ -67,14 +67,14 @@ class Recording:
     Images and poses in the order of their stamps, each by its sensor's clock.
     """
 
-    camera: RollingShutterCamera | None   # None: not calibrated, and the bag has no CameraInfo
+    camera: RollingShutterCamera | None  # None: not calibrated, and the bag has no CameraInfo
     images: Sequence[RecordedImage]
-    imu: Sequence[ImuSample]   # in its own axes; without `accel` gyro and accelerometer together
-    title: str   # head of the parameter file
+    imu: Sequence[ImuSample]  # in its own axes; without `accel` gyro and accelerometer together
+    title: str  # head of the parameter file
     parameters: tuple[SourcedValue, ...]
-    accel: Sequence[ImuSample] = ()   # samples of an accelerometer with stamps of its own
-    truth: tuple[TruePose, ...] = ()   # of the camera's optical frame, on the IMU's clock
-    image_format: str = COLOUR_JPEG   # as in sensor_msgs/CompressedImage
+    accel: Sequence[ImuSample] = ()  # samples of an accelerometer with stamps of its own
+    truth: tuple[TruePose, ...] = ()  # of the camera's optical frame, on the IMU's clock
+    image_format: str = COLOUR_JPEG  # as in sensor_msgs/CompressedImage
 
     def __post_init__(self) -> None:
         for name in ('imu', 'accel'):
@@ -84,17 +84,22 @@ class Recording:
             raise MissingInputError('a recording needs at least one image and one IMU sample')
         for earlier, later in pairwise(self.images):
             if later.stamp_ns <= earlier.stamp_ns:
-                raise InputError(f'{later.name} is stamped {later.stamp_ns} ns, not after '
-                                 f'the {earlier.stamp_ns} ns of {earlier.name} before it')
+                raise InputError(
+                    f'{later.name} is stamped {later.stamp_ns} ns, not after '
+                    f'the {earlier.stamp_ns} ns of {earlier.name} before it'
+                )
         first, last = self.images[0].stamp_ns, self.images[-1].stamp_ns
         if first < 0 or last >= _END_NS:
-            raise InputError(f'the images are stamped from {first} to {last} ns, but stamps of '
-                             f'ROS are from 0 to {_END_NS} ns')
+            raise InputError(
+                f'the images are stamped from {first} to {last} ns, but stamps of '
+                f'ROS are from 0 to {_END_NS} ns'
+            )
         if self.imu[-1].stamp_ns < first or self.imu[0].stamp_ns > last:
             raise InputError(
                 f'the IMU samples, from {self.imu[0].stamp_ns} to {self.imu[-1].stamp_ns} ns, '
                 f'and the images, from {first} to {last} ns, have no time in common: they are '
-                'not of the same recording, or their stamps are not on one clock')
+                'not of the same recording, or their stamps are not on one clock'
+            )
 
     def cropped(self, samples: Sequence[ImuSample]) -> list[ImuSample]:
         """Those of `imu` or `accel` up to shortly after the last image, as the bag has them."""
@@ -102,8 +107,9 @@ class Recording:
         return [sample for sample in samples if sample.stamp_ns <= end_ns]
 
 
-def write_bag(recording: Recording, path: Path | str,
-              on_image: Callable[[], object] = lambda: None) -> None:
+def write_bag(
+    recording: Recording, path: Path | str, on_image: Callable[[], object] = lambda: None
+) -> None:
     """Write a recording as a bag, with the receive times of a driver, by which readers sort.
 
     Stamps and JPEG bytes are not changed. `on_image` is called after each image.
@@ -122,32 +128,54 @@ def write_bag(recording: Recording, path: Path | str,
                 raise InputError(f'{image.name}: {error}') from error
             size = size or found
             if found != size:
-                raise InputError(f'{image.name} has {found[0]}x{found[1]} pixels, but {reference} '
-                                 f'{size[0]}x{size[1]}')
+                raise InputError(
+                    f'{image.name} has {found[0]}x{found[1]} pixels, but {reference} '
+                    f'{size[0]}x{size[1]}'
+                )
             bag_time_ns = image.stamp_ns + to_nanoseconds(delay)
             place = image.stamp_ns, reader.CAMERA_FRAME
             if camera is not None:
-                bag.write(reader.CAMERA_INFO_TOPIC, reader.CAMERA_INFO,
-                          outgoing.camera_info_message(*place, camera, None, bag.type),
-                          bag_time_ns)
-            bag.write(reader.COMPRESSED_TOPIC, reader.COMPRESSED_IMAGE,
-                      outgoing.encoded_image_message(*place, data, bag.type,
-                                                     recording.image_format), bag_time_ns)
+                bag.write(
+                    reader.CAMERA_INFO_TOPIC,
+                    reader.CAMERA_INFO,
+                    outgoing.camera_info_message(*place, camera, None, bag.type),
+                    bag_time_ns,
+                )
+            bag.write(
+                reader.COMPRESSED_TOPIC,
+                reader.COMPRESSED_IMAGE,
+                outgoing.encoded_image_message(*place, data, bag.type, recording.image_format),
+                bag_time_ns,
+            )
             on_image()
         imu_topic = reader.GYRO_TOPIC if recording.accel else reader.IMU_TOPIC
         for topic, samples in ((imu_topic, recording.imu), (reader.ACCEL_TOPIC, recording.accel)):
             for sample in recording.cropped(samples):
-                bag.write(topic, reader.IMU, outgoing.imu_message(
-                    sample.stamp_ns, reader.IMU_FRAME, sample.angular_velocity,
-                    sample.linear_acceleration, bag.type), sample.stamp_ns + imu_delay_ns)
+                bag.write(
+                    topic,
+                    reader.IMU,
+                    outgoing.imu_message(
+                        sample.stamp_ns,
+                        reader.IMU_FRAME,
+                        sample.angular_velocity,
+                        sample.linear_acceleration,
+                        bag.type,
+                    ),
+                    sample.stamp_ns + imu_delay_ns,
+                )
         for pose in recording.truth:
-            bag.write(reader.GROUND_TRUTH_TOPIC, reader.POSE_STAMPED,
-                      outgoing.pose_stamped_message(pose.stamp_ns, reader.WORLD_FRAME,
-                                                    pose.quat_xyzw, pose.position, bag.type),
-                      pose.stamp_ns + imu_delay_ns)
+            bag.write(
+                reader.GROUND_TRUTH_TOPIC,
+                reader.POSE_STAMPED,
+                outgoing.pose_stamped_message(
+                    pose.stamp_ns, reader.WORLD_FRAME, pose.quat_xyzw, pose.position, bag.type
+                ),
+                pose.stamp_ns + imu_delay_ns,
+            )
 
 
 # -- Text files: each error names the file and the line -------------------------------------------
+
 
 class Row(NamedTuple):
     """Words of one line of a file by the name of their column, or its number from 0."""
@@ -163,8 +191,9 @@ class Row(NamedTuple):
     def word(self, column: str | int) -> Any:
         """The text in a column."""
         if column not in self.words:
-            raise self.error(f'it has no column {column}, only '
-                             f'{", ".join(map(str, self.words))[:200]}')
+            raise self.error(
+                f'it has no column {column}, only {", ".join(map(str, self.words))[:200]}'
+            )
         return self.words[column]
 
     def real(self, column: str | int) -> float:
@@ -186,11 +215,19 @@ class Row(NamedTuple):
     def seconds_as_nanoseconds(self, column: str | int, start_ns: int = 0) -> int:
         """A stamp [ns], written in decimal seconds since a start; rounded, without a float."""
         return self._number(
-            column, 'a stamp in seconds',
-            lambda text: start_ns + round(Decimal(text) * NANOSECONDS), _is_stamp)
+            column,
+            'a stamp in seconds',
+            lambda text: start_ns + round(Decimal(text) * NANOSECONDS),
+            _is_stamp,
+        )
 
-    def _number(self, column: str | int, legal: str, convert: Callable[[str], _Value],
-                is_legal: Callable[[_Value], bool] = lambda _: True) -> _Value:
+    def _number(
+        self,
+        column: str | int,
+        legal: str,
+        convert: Callable[[str], _Value],
+        is_legal: Callable[[_Value], bool] = lambda _: True,
+    ) -> _Value:
         text = self.word(column)
         with suppress(ValueError, ArithmeticError):
             if isinstance(text, str) and is_legal(value := convert(text)):
@@ -203,8 +240,9 @@ def _is_stamp(value: int) -> bool:
     return 0 <= value < _END_NS
 
 
-def read_rows(path: Path, columns: Sequence[str | int] | None = None,
-              separator: str | None = ',') -> Iterator[Row]:
+def read_rows(
+    path: Path, columns: Sequence[str | int] | None = None, separator: str | None = ','
+) -> Iterator[Row]:
     """Rows of a text file, without empty lines and those that begin with '#'.
 
     Each must have all `columns`: without them those of the first line. `separator`: None for white

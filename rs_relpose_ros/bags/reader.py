@@ -81,6 +81,7 @@ def _bounded_file(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
     limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * size
     count = 0
     with _zstd.open(file, mode) as stream:
+
         def read(most: int) -> bytes:
             nonlocal count
             data: bytes = stream.read(most)
@@ -116,8 +117,15 @@ _TABLES: Any = (
     (mcap.DECOMPRESSORS, 'lz4', _chunk(LZ4FrameDecompressor)),
     (rosbag1.decompressors, 'lz4', _chunk(LZ4FrameDecompressor)),
     (rosbag1.decompressors, 'bz2', _chunk(bz2.BZ2Decompressor)),
-    (vars(rosbag2), 'zstd', SimpleNamespace(open=_bounded_file, decompress=lambda data: (
-        _decompressed(_zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES)))))
+    (
+        vars(rosbag2),
+        'zstd',
+        SimpleNamespace(
+            open=_bounded_file,
+            decompress=lambda data: _decompressed(_zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES),
+        ),
+    ),
+)
 for _table, _name, _bounded in _TABLES:
     if _name not in _table:
         raise ImportError(f'rosbags decompresses {_name} in another way than 0.11 does')
@@ -126,14 +134,17 @@ for _table, _name, _bounded in _TABLES:
 
 # -- Checks before a parser reads the files -------------------------------------------------------
 
+
 def _check_path(path: Path) -> None:
     """Raise where there is no bag, or one without usable metadata."""
     if not path.exists():
         raise MissingInputError(f'there is no bag at {path}')
     if not path.is_dir():
         if path.suffix not in (*_STORAGE_SUFFIXES, '.bag'):
-            raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or '
-                             'a .mcap, .db3 or .bag file')
+            raise InputError(
+                f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or '
+                'a .mcap, .db3 or .bag file'
+            )
         return
     metadata = path / 'metadata.yaml'
     if not metadata.exists():
@@ -141,18 +152,22 @@ def _check_path(path: Path) -> None:
             if file.suffix in _STORAGE_SUFFIXES:
                 raise InputError(
                     f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
-                    f'{file.name} itself, or make one with "ros2 bag reindex {path}"')
+                    f'{file.name} itself, or make one with "ros2 bag reindex {path}"'
+                )
         raise InputError(f'{path} is no bag: it has no metadata.yaml')
     if metadata.stat().st_size > _MAX_METADATA_BYTES:
-        raise InputError(f'{metadata} is no metadata of a bag: it has more than '
-                         f'{_MAX_METADATA_BYTES} bytes')
+        raise InputError(
+            f'{metadata} is no metadata of a bag: it has more than {_MAX_METADATA_BYTES} bytes'
+        )
     content = metadata.read_bytes()
-    with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
+    with suppress(yaml.YAMLError, RecursionError):  # no YAML: refused by the reader
         # Printed, aliases can be endless.
         if b'*' in content and any(
-                isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
-            raise InputError(f'{metadata} has YAML aliases, which no recorder writes: it is '
-                             'damaged')
+            isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)
+        ):
+            raise InputError(
+                f'{metadata} has YAML aliases, which no recorder writes: it is damaged'
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,9 +192,9 @@ class SensorTopics:
     """Topics to read."""
 
     image: Topic
-    camera_info: Topic | None   # None only if it is not needed
+    camera_info: Topic | None  # None only if it is not needed
     imu: Topic
-    accel: Topic | None   # only if the driver publishes it separately
+    accel: Topic | None  # only if the driver publishes it separately
     truth: Topic | None
 
 
@@ -198,25 +213,38 @@ class _TopicFinder:
 
     bag: Path
     topics: Sequence[Topic]
-    names: Mapping[str, str]   # those chosen, by role
-    complete: bool = True   # whether an absent topic is an error
+    names: Mapping[str, str]  # those chosen, by role
+    complete: bool = True  # whether an absent topic is an error
 
     def find(self, needs_camera_info: bool) -> Chosen:
         image = self.one('image', 'image', IMAGE, COMPRESSED_IMAGE)
         if self.complete and image and 'image_rect' in image.name:
-            raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
-                             'one time: choose the raw one with --image-topic')
+            raise InputError(
+                f'{image.name} is a rectified image, in which a row no longer has '
+                'one time: choose the raw one with --image-topic'
+            )
         imu, accel = self._imu()
         camera_info = None
         if needs_camera_info or self.names.get('camera_info') or self._of_type(CAMERA_INFO):
             camera_info = self.one(
-                'camera_info', 'CameraInfo', CAMERA_INFO, preferred=image.camera_info if image
-                else '', fix='; give camera_matrix, whose focal length "rs_relpose calibrate" '
-                'estimates')
+                'camera_info',
+                'CameraInfo',
+                CAMERA_INFO,
+                preferred=image.camera_info if image else '',
+                fix='; give camera_matrix, whose focal length "rs_relpose calibrate" estimates',
+            )
         return Chosen(image, camera_info, imu, accel)
 
-    def one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
-            preferred: str = '', without: Topic | None = None) -> Topic | None:
+    def one(
+        self,
+        role: str,
+        content: str,
+        *msgtypes: str,
+        fix: str = '',
+        hint: str = '',
+        preferred: str = '',
+        without: Topic | None = None,
+    ) -> Topic | None:
         """The chosen topic, or that of a name, or the only one of these types.
 
         `fix` if there is none, `hint` if there are several; the ground truth may be absent.
@@ -225,8 +253,10 @@ class _TopicFinder:
             return chosen
         candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
         candidates = [topic for topic in candidates if topic.name == preferred] or candidates
-        several = (f'{self.bag} has several {content} topics, choose one with {_option(role)}'
-                   f'{hint}: {", ".join(map(str, candidates))}')
+        several = (
+            f'{self.bag} has several {content} topics, choose one with {_option(role)}'
+            f'{hint}: {", ".join(map(str, candidates))}'
+        )
         if role == 'truth' or not (candidates or self.complete):
             if len(candidates) > 1:
                 _logger.warning('%s; none is used', several)
@@ -245,8 +275,10 @@ class _TopicFinder:
         if not found:
             raise self._missing(f'topic {name} ({option})')
         if found[0].msgtype not in msgtypes:
-            raise InputError(f'topic {name} ({option}) is of type {found[0].msgtype}, but must be '
-                             f'{" or ".join(msgtypes)}')
+            raise InputError(
+                f'topic {name} ({option}) is of type {found[0].msgtype}, but must be '
+                f'{" or ".join(msgtypes)}'
+            )
         if not found[0].count:
             raise MissingInputError(f'topic {name} ({option}) of {self.bag} has no messages')
         return found[0]
@@ -256,20 +288,28 @@ class _TopicFinder:
         accel = self._chosen('accel', IMU)
         candidates = self._of_type(IMU)
         if not (self.names.get('imu') or accel) and len(candidates) == 2:
-            gyros, accels = ([topic for topic in candidates if word in topic.name]
-                             for word in ('gyro', 'accel'))
+            gyros, accels = (
+                [topic for topic in candidates if word in topic.name] for word in ('gyro', 'accel')
+            )
             if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
                 return gyros[0], accels[0]
-        return self.one('imu', 'IMU', IMU, without=accel,
-                         hint=' (and --accel-topic for a separate accelerometer)'), accel
+        return self.one(
+            'imu',
+            'IMU',
+            IMU,
+            without=accel,
+            hint=' (and --accel-topic for a separate accelerometer)',
+        ), accel
 
     def _of_type(self, *msgtypes: str) -> list[Topic]:
         return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
 
     def _missing(self, content: str) -> MissingInputError:
         there = ', '.join(map(str, self.topics))
-        return MissingInputError(f'{self.bag} has no {content}; '
-                                 + (f'it has {there}' if there else 'it has no topics at all'))
+        return MissingInputError(
+            f'{self.bag} has no {content}; '
+            + (f'it has {there}' if there else 'it has no topics at all')
+        )
 
 
 def _option(role: str) -> str:
@@ -324,24 +364,34 @@ class Bag:
         # Typed, but metadata is YAML: any value can be of any type.
         connections: Any = reader.connections
         for connection in connections:
-            if not (isinstance(connection.topic, str) and connection.topic.isprintable()
-                    and isinstance(connection.msgtype, str) and connection.msgtype.isprintable()
-                    and isinstance(connection.msgcount, int)):
-                raise InputError(f'{path} is damaged: in its metadata, name, type or number of '
-                                 'messages of a topic is invalid')
+            if not (
+                isinstance(connection.topic, str)
+                and connection.topic.isprintable()
+                and isinstance(connection.msgtype, str)
+                and connection.msgtype.isprintable()
+                and isinstance(connection.msgcount, int)
+            ):
+                raise InputError(
+                    f'{path} is damaged: in its metadata, name, type or number of '
+                    'messages of a topic is invalid'
+                )
             key = connection.topic, connection.msgtype
             self._by_topic.setdefault(key, connection)
             counts[key] = counts.get(key, 0) + connection.msgcount
-        self.topics = tuple(Topic(name, msgtype, count)
-                            for (name, msgtype), count in sorted(counts.items()))
+        self.topics = tuple(
+            Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items())
+        )
         # Time from the first to the last message [s].
         self.duration = float(reader.duration) / NANOSECONDS
 
     def reliability(self, topic: Topic) -> str:
         """``'reliable'`` or ``'best effort'`` as its publishers offered; empty if not recorded."""
-        offered = {profile.reliability for connection in self._connections([topic])
-                   if isinstance(connection.ext, ConnectionExtRosbag2)
-                   for profile in connection.ext.offered_qos_profiles}
+        offered = {
+            profile.reliability
+            for connection in self._connections([topic])
+            if isinstance(connection.ext, ConnectionExtRosbag2)
+            for profile in connection.ext.offered_qos_profiles
+        }
         if QosReliability.BEST_EFFORT in offered:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
@@ -351,16 +401,20 @@ class Bag:
         connection = self._connections([topic])[0]
         if not isinstance(connection.ext, ConnectionExtRosbag2):
             return {'msgdef': '', 'offered_qos_profiles': LATCH if connection.ext.latching else ()}
-        return {'msgdef': connection.msgdef.data, 'rihs01': connection.digest,
-                'serialization_format': connection.ext.serialization_format,
-                'offered_qos_profiles': connection.ext.offered_qos_profiles}
+        return {
+            'msgdef': connection.msgdef.data,
+            'rihs01': connection.digest,
+            'serialization_format': connection.ext.serialization_format,
+            'offered_qos_profiles': connection.ext.offered_qos_profiles,
+        }
 
     def can_be_copied(self, topic: Topic) -> bool:
         """Whether `raw_messages` can read it: of ROS 1 only types that ROS 2 has, too."""
         return self._is_ros2 or topic.msgtype in _types(of_ros2=True).fielddefs
 
-    def find_topics(self, names: Mapping[str, str] | None = None, *,
-                    needs_camera_info: bool = True) -> SensorTopics:
+    def find_topics(
+        self, names: Mapping[str, str] | None = None, *, needs_camera_info: bool = True
+    ) -> SensorTopics:
         """The sensors' topics: as chosen, or by type if that is unambiguous.
 
         `names`: those chosen, by field of `SensorTopics`; empty ones are as if absent. Of several
@@ -389,9 +443,11 @@ class Bag:
         for connection, bag_time_ns, data in self._raw(topics):
             if not self._is_ros2:
                 if connection.msgtype not in typestore.fielddefs:
-                    raise InputError(f'topic {connection.topic} of {self.path} is of type '
-                                     f'{connection.msgtype}, which ROS 2 does not have: leave it '
-                                     'out')
+                    raise InputError(
+                        f'topic {connection.topic} of {self.path} is of type '
+                        f'{connection.msgtype}, which ROS 2 does not have: leave it '
+                        'out'
+                    )
                 data = bytes(self._decoded(connection, typestore.ros1_to_cdr, data))
             yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, data)
 
@@ -411,8 +467,10 @@ class Bag:
         try:
             for connection, bag_time_ns, data in self._reader.messages(connections):
                 if len(data) > MAX_MESSAGE_BYTES:
-                    raise InputError(f'a message of {connection.topic} has {len(data)} bytes; at '
-                                     f'most {MAX_MESSAGE_BYTES} are read')
+                    raise InputError(
+                        f'a message of {connection.topic} has {len(data)} bytes; at '
+                        f'most {MAX_MESSAGE_BYTES} are read'
+                    )
                 self.on_message(connection.topic)
                 yield connection, bag_time_ns, data
         # A damaged file can raise anything in the parsers.
@@ -421,18 +479,24 @@ class Bag:
 
     def _decoded(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
         """Decode a message, unless its type had other fields in the ROS of the recorder."""
-        if (connection.msgtype in _types(self._is_ros2).fielddefs and connection.digest
-                and connection.digest != _type_hash(connection.msgtype, self._is_ros2)):
+        if (
+            connection.msgtype in _types(self._is_ros2).fielddefs
+            and connection.digest
+            and connection.digest != _type_hash(connection.msgtype, self._is_ros2)
+        ):
             name = 'ROS 2 Jazzy' if self._is_ros2 else 'ROS 1 Noetic'
-            raise InputError(f'topic {connection.topic} of {self.path} is of another '
-                             f'{connection.msgtype} than that of {name}: its type hash is '
-                             f'{str(connection.digest)[:80]!r}')
+            raise InputError(
+                f'topic {connection.topic} of {self.path} is of another '
+                f'{connection.msgtype} than that of {name}: its type hash is '
+                f'{str(connection.digest)[:80]!r}'
+            )
         try:
             return decode(data, connection.msgtype)
         except Exception as error:
             raise InputError(
                 f'a message of {connection.topic} in {self.path} is corrupt, it is no '
-                f'{connection.msgtype}: {_message(error)}') from error
+                f'{connection.msgtype}: {_message(error)}'
+            ) from error
 
 
 @contextmanager
@@ -452,9 +516,11 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
         # A damaged file can raise anything in the parsers.
         except Exception as error:
             storage = next(path.glob('*.mcap'), path)
-            fix = {'.bag': f'; try "rosbag reindex {path.name}"',
-                   '.mcap': '; if it is truncated, copy it again, or "mcap recover '
-                            f'{storage.name} -o recovered.mcap"'}.get(storage.suffix, '')
+            fix = {
+                '.bag': f'; try "rosbag reindex {path.name}"',
+                '.mcap': '; if it is truncated, copy it again, or "mcap recover '
+                f'{storage.name} -o recovered.mcap"',
+            }.get(storage.suffix, '')
             kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
             raise InputError(f'{path} {kind}: {_message(error)}{fix}') from error
         yield bag

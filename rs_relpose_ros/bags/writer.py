@@ -61,10 +61,13 @@ class BagWriter:
             connection = self._writer.add_connection(topic, msgtype, typestore=self._typestore)
             self._connections[topic] = connection
         elif connection.msgtype != msgtype:
-            raise InputError(f'topic {topic} of the bag {self.path} carries {connection.msgtype}, '
-                             f'it cannot carry {msgtype} as well')
+            raise InputError(
+                f'topic {topic} of the bag {self.path} carries {connection.msgtype}, '
+                f'it cannot carry {msgtype} as well'
+            )
         self._writer.write(
-            connection, bag_time_ns, self._typestore.serialize_cdr(message, msgtype))
+            connection, bag_time_ns, self._typestore.serialize_cdr(message, msgtype)
+        )
 
     def announce(self, topic: Topic, origin: dict[str, Any]) -> None:
         """Announce a topic whose messages are copied or replaced; `origin` is that of `Bag`."""
@@ -72,11 +75,11 @@ class BagWriter:
         if topic.msgtype in self._typestore.fielddefs and not origin['msgdef']:
             del origin['msgdef'], origin['rihs01']
         connection = self._writer.add_connection(
-            topic.name, topic.msgtype, typestore=self._typestore, **origin)
+            topic.name, topic.msgtype, typestore=self._typestore, **origin
+        )
         self._copied[topic.name, topic.msgtype] = connection
         self._connections.setdefault(topic.name, connection)
 
     def copy(self, raw: RawMessage) -> None:
         """Append an unchanged message of an announced topic."""
         self._writer.write(self._copied[raw.topic, raw.msgtype], raw.bag_time_ns, raw.data)
-

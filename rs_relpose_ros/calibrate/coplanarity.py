@@ -29,12 +29,13 @@ from rs_relpose_ros.jit import inlined_kernel, kernel
 
 # -- Orientation by the gyro at any time --------------------------------------------------------
 
+
 class GyroPath(NamedTuple):
     """Integrated gyro with K knots: rates are linear between neighbouring knots."""
 
-    times: Array        # (K,) [s]
-    rates: Array        # (K, 3) without the bias [rad/s]
-    rotations: Array    # (K, 3, 3) R_start^T R_k, IMU frame
+    times: Array  # (K,) [s]
+    rates: Array  # (K, 3) without the bias [rad/s]
+    rotations: Array  # (K, 3, 3) R_start^T R_k, IMU frame
     # (K, 3, 3) integral of the rotations over time [s]: a rate error db turns the rotation at knot
     # k by ``turned_k db``, in the frame of the start.
     turned: Array
@@ -44,8 +45,9 @@ class GyroPath(NamedTuple):
         """Integrate rates (K, 3) at times (K,) after subtracting a bias (3,)."""
         rates = measured - bias
         rotations = _integrated(times, rates)
-        return cls(times, rates, rotations,
-                   cumulative_trapezoid(rotations, times, axis=0, initial=0.0))
+        return cls(
+            times, rates, rotations, cumulative_trapezoid(rotations, times, axis=0, initial=0.0)
+        )
 
     def at(self, times: Array) -> Array:
         """Rotations (N, 3, 3) at times (N,); extrapolated outside of the knots."""
@@ -58,18 +60,22 @@ def _integrated(times: Array, rates: Array) -> Array:
     rotations = np.empty((len(times), 3, 3))
     rotations[0] = np.eye(3)
     for k in range(len(times) - 1):
-        _path_rotation(rotations[k], rates[k], rates[k + 1], times[k + 1] - times[k],
-                       rotations[k + 1])
+        _path_rotation(
+            rotations[k], rates[k], rates[k + 1], times[k + 1] - times[k], rotations[k + 1]
+        )
     return rotations
 
 
 @inlined_kernel
 def _path_rotation(rotation: Array, rate1: Array, rate2: Array, dt: float, out: Array) -> None:
     """Write ``R Exp(phi)`` with ``phi = (w_1 + w_2) dt / 2``: Rodrigues' formula for each row."""
-    phi = (0.5 * dt * (rate1[0] + rate2[0]), 0.5 * dt * (rate1[1] + rate2[1]),
-           0.5 * dt * (rate1[2] + rate2[2]))
+    phi = (
+        0.5 * dt * (rate1[0] + rate2[0]),
+        0.5 * dt * (rate1[1] + rate2[1]),
+        0.5 * dt * (rate1[2] + rate2[2]),
+    )
     square = dot(phi, phi)
-    if square < 0.01:   # to 1e-14; without sine and cosine twice as fast
+    if square < 0.01:  # to 1e-14; without sine and cosine twice as fast
         a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
         b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
     else:
@@ -119,7 +125,16 @@ def _evaluated(path: GyroPath, at: Array) -> Array:
 # lens, beyond the assumed camera: logarithm of the focal length, first coefficient of the
 # distortion, principal point (2) [px]; square of the exposure beyond the assumed one [s^2].
 READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL, RADIAL, CENTER, EXPOSURE = (
-    0, 1, 2, 3, 6, 9, 10, 11, 13)
+    0,
+    1,
+    2,
+    3,
+    6,
+    9,
+    10,
+    11,
+    13,
+)
 GLOBAL = 14
 LENS = slice(FOCAL, EXPOSURE)
 _OF_LENS = EXPOSURE - FOCAL
@@ -134,28 +149,28 @@ ROBUST = 3.0
 class Problem(NamedTuple):
     """Data of a fit to P pairs with N matches in all."""
 
-    gyro_times: Array             # (K,) [s]
-    gyro_rates: Array             # (K, 3) mean over the assumed exposure [rad/s]
+    gyro_times: Array  # (K,) [s]
+    gyro_rates: Array  # (K, 3) mean over the assumed exposure [rad/s]
     # (K, 3) their derivative by the square of the exposure [rad/s^3], and its integral over time
     # [rad/s^2].
     blur_rates: Array
     blur_turns: Array
-    times: Array                  # (2, P) stamps of the frames of each pair [s]
-    covariates: Array             # (2, P) covariates k_i of the offset; see `FrameTimes` [s]
-    begin: NDArray[np.int64]      # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
+    times: Array  # (2, P) stamps of the frames of each pair [s]
+    covariates: Array  # (2, P) covariates k_i of the offset; see `FrameTimes` [s]
+    begin: NDArray[np.int64]  # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
     # (P,) knot of the gyro near the middle of the pair. `direction`, `bend` and `turn` are in the
     # frame of that knot: in that of the start they would rotate with each step of the bias.
     middle: NDArray[np.int64]
     # Of both frames of each match:
-    rows: Array                   # (2, N) s(v) of the raw rows
-    points: Array                 # (2, N, 2) undistorted and normalised with the assumed camera
-    by_pixel: Array               # (2, N, 2, 2) derivative of the normalised point by the pixel
-    by_lens: Array                # (2, N, 2, 4) derivative of the normalised point by the lens
-    by_pixel_by_lens: Array       # (2, N, 2, 2, 4) derivative of `by_pixel` by the lens
-    bend_sigma: Array             # (P,) 1 sigma of each component of `bend`
-    turn_sigma: Array             # (P,) 1 sigma of each component of `turn` [rad]
-    prior: Array                  # (GLOBAL,) inverse variances of the parameters
-    center: Array                 # (GLOBAL,) their means by the prior
+    rows: Array  # (2, N) s(v) of the raw rows
+    points: Array  # (2, N, 2) undistorted and normalised with the assumed camera
+    by_pixel: Array  # (2, N, 2, 2) derivative of the normalised point by the pixel
+    by_lens: Array  # (2, N, 2, 4) derivative of the normalised point by the lens
+    by_pixel_by_lens: Array  # (2, N, 2, 2, 4) derivative of `by_pixel` by the lens
+    bend_sigma: Array  # (P,) 1 sigma of each component of `bend`
+    turn_sigma: Array  # (P,) 1 sigma of each component of `turn` [rad]
+    prior: Array  # (GLOBAL,) inverse variances of the parameters
+    center: Array  # (GLOBAL,) their means by the prior
 
     @property
     def pairs(self) -> int:
@@ -174,8 +189,10 @@ class Problem(NamedTuple):
 
     def matches(self, kept: NDArray[np.bool_]) -> Problem:
         """The same pairs with some of their matches (N,)."""
-        some: dict[str, Any] = {name: np.compress(kept, getattr(self, name), axis=1) for name in (
-            'rows', 'points', 'by_pixel', 'by_lens', 'by_pixel_by_lens')}
+        some: dict[str, Any] = {
+            name: np.compress(kept, getattr(self, name), axis=1)
+            for name in ('rows', 'points', 'by_pixel', 'by_lens', 'by_pixel_by_lens')
+        }
         return self._replace(begin=np.cumsum([0, *kept])[self.begin], **some)
 
     def pairs_of(self, kept: NDArray[np.bool_]) -> Problem:
@@ -184,8 +201,11 @@ class Problem(NamedTuple):
         return some._replace(
             times=np.compress(kept, self.times, axis=1),
             covariates=np.compress(kept, self.covariates, axis=1),
-            begin=np.cumsum([0, *np.diff(self.begin)[kept]]), middle=self.middle[kept],
-            bend_sigma=self.bend_sigma[kept], turn_sigma=self.turn_sigma[kept])
+            begin=np.cumsum([0, *np.diff(self.begin)[kept]]),
+            middle=self.middle[kept],
+            bend_sigma=self.bend_sigma[kept],
+            turn_sigma=self.turn_sigma[kept],
+        )
 
 
 class Unknowns(NamedTuple):
@@ -193,34 +213,35 @@ class Unknowns(NamedTuple):
 
     # (GLOBAL,) with zeros in place of the rotation, which is `R_imu_cam`.
     parameters: Array
-    R_imu_cam: Array    # (3, 3)
-    own: Array          # (P, 9) of each pair: unit vector `direction`, `bend`, and `turn` [rad]
-    noise: Array        # (P,) 1 sigma of the residuals [px]
-    damping: Array      # (P,) Levenberg-Marquardt damping of the pair's own unknowns
+    R_imu_cam: Array  # (3, 3)
+    own: Array  # (P, 9) of each pair: unit vector `direction`, `bend`, and `turn` [rad]
+    noise: Array  # (P,) 1 sigma of the residuals [px]
+    damping: Array  # (P,) Levenberg-Marquardt damping of the pair's own unknowns
 
     def pairs_of(self, kept: NDArray[np.bool_]) -> Unknowns:
         """The same calibration for some of the pairs (P,)."""
-        return self._replace(own=self.own[kept], noise=self.noise[kept],
-                             damping=self.damping[kept])
+        return self._replace(
+            own=self.own[kept], noise=self.noise[kept], damping=self.damping[kept]
+        )
 
 
 class Sums(NamedTuple):
     """Results of a pass over all matches; the last two are empty unless requested."""
 
-    losses: Array       # (P,) robust loss
-    residuals: Array    # (N,) [px]
-    gradient: Array     # (P, ALL) of the losses
-    hessian: Array      # (P, ALL, ALL) Gauss-Newton approximation, lower triangles
+    losses: Array  # (P,) robust loss
+    residuals: Array  # (N,) [px]
+    gradient: Array  # (P, ALL) of the losses
+    hessian: Array  # (P, ALL, ALL) Gauss-Newton approximation, lower triangles
 
 
 class _Sight(NamedTuple):
     """Memory for the camera at the time of a row; overwritten for each match."""
 
-    Q: Array         # (3, 3) rotation of the IMU
-    M: Array         # (3, 3) rotation of the camera
-    rate: Array      # (3,) of the IMU [rad/s]
-    blur: Array      # (3,) turn of the IMU by the square of the exposure [rad/s^2]
-    by_bias: Array   # (3, 3) integral of the rotations since the middle of the pair [s]
+    Q: Array  # (3, 3) rotation of the IMU
+    M: Array  # (3, 3) rotation of the camera
+    rate: Array  # (3,) of the IMU [rad/s]
+    blur: Array  # (3,) turn of the IMU by the square of the exposure [rad/s^2]
+    by_bias: Array  # (3, 3) integral of the rotations since the middle of the pair [s]
 
 
 @kernel
@@ -229,8 +250,15 @@ def _new_sight() -> _Sight:
 
 
 @inlined_kernel
-def _look(path: GyroPath, R_imu_cam: Array, correction: Array, point: Array, time: float,
-          near: int, sight: _Sight) -> tuple[int, Vector]:
+def _look(
+    path: GyroPath,
+    R_imu_cam: Array,
+    correction: Array,
+    point: Array,
+    time: float,
+    near: int,
+    sight: _Sight,
+) -> tuple[int, Vector]:
     """Fill Q, M and rate of `sight` at a time; the knot before it, and the ray of a point."""
     k = _knot_before(path.times, time, near)
     _rotation_at(path, time, k, sight.M, sight.rate)
@@ -244,7 +272,8 @@ def _starts(problem: Problem, p: int, parameters: Array) -> tuple[float, float]:
     """Times of the middle rows of a pair on the clock of the gyro [s]."""
     return (
         problem.times[0, p] + parameters[OFFSET] + parameters[SLOPE] * problem.covariates[0, p],
-        problem.times[1, p] + parameters[OFFSET] + parameters[SLOPE] * problem.covariates[1, p])
+        problem.times[1, p] + parameters[OFFSET] + parameters[SLOPE] * problem.covariates[1, p],
+    )
 
 
 @inlined_kernel
@@ -260,13 +289,25 @@ def _by_pixels(M: Array, P: Array, c: Vector) -> tuple[float, Vector]:
 @inlined_kernel
 def _less(a: Vector, factor: float, b: Vector, divisor: float) -> Vector:
     """``(a - factor b) / divisor``."""
-    return ((a[0] - factor * b[0]) / divisor, (a[1] - factor * b[1]) / divisor,
-            (a[2] - factor * b[2]) / divisor)
+    return (
+        (a[0] - factor * b[0]) / divisor,
+        (a[1] - factor * b[1]) / divisor,
+        (a[2] - factor * b[2]) / divisor,
+    )
 
 
 @inlined_kernel
-def _derivatives(r: float, s: float, m1: Vector, m2: Vector, b: Vector, c1: Vector, c2: Vector,
-                 k1: Vector, k2: Vector) -> tuple[Vector, Vector, Vector, Vector, Vector]:
+def _derivatives(
+    r: float,
+    s: float,
+    m1: Vector,
+    m2: Vector,
+    b: Vector,
+    c1: Vector,
+    c2: Vector,
+    k1: Vector,
+    k2: Vector,
+) -> tuple[Vector, Vector, Vector, Vector, Vector]:
     """Of r by m_1 and m_2, by a small rotation of all of frame 1 and of frame 2, and by b.
 
     ``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``.
@@ -282,8 +323,15 @@ def _derivatives(r: float, s: float, m1: Vector, m2: Vector, b: Vector, c1: Vect
 
 
 @inlined_kernel
-def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: float, share: float,
-              Q_middle: Array) -> None:
+def _add_view(
+    J: Array,
+    by_turn: Vector,
+    sight: _Sight,
+    row: float,
+    covariate: float,
+    share: float,
+    Q_middle: Array,
+) -> None:
     """Add the derivatives through the orientation of one frame.
 
     `by_turn` is the derivative by a small rotation of the frame, of which `share` follows `turn`.
@@ -303,8 +351,9 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
 
 
 @inlined_kernel
-def _add_lens(J: Array, problem: Problem, side: int, n: int, by_m: Vector, c: Vector, M: Array,
-              ratio: float) -> None:
+def _add_lens(
+    J: Array, problem: Problem, side: int, n: int, by_m: Vector, c: Vector, M: Array, ratio: float
+) -> None:
     """Add the derivatives by the lens through one frame: by its ray, and by s through P.
 
     ``s ds = (P^T h) . (dP^T h)`` with ``h = M^T c``; `ratio` is r / s^2.
@@ -314,24 +363,30 @@ def _add_lens(J: Array, problem: Problem, side: int, n: int, by_m: Vector, c: Ve
     q1 = ratio * (P[0, 1] * h[0] + P[1, 1] * h[1])
     by_lens, dP = problem.by_lens[side, n], problem.by_pixel_by_lens[side, n]
     for k in range(_OF_LENS):
-        J[FOCAL + k] += (by_point[0] * by_lens[0, k] + by_point[1] * by_lens[1, k]
-                         - q0 * (dP[0, 0, k] * h[0] + dP[1, 0, k] * h[1])
-                         - q1 * (dP[0, 1, k] * h[0] + dP[1, 1, k] * h[1]))
+        J[FOCAL + k] += (
+            by_point[0] * by_lens[0, k]
+            + by_point[1] * by_lens[1, k]
+            - q0 * (dP[0, 0, k] * h[0] + dP[1, 0, k] * h[1])
+            - q1 * (dP[0, 1, k] * h[0] + dP[1, 1, k] * h[1])
+        )
 
 
 @inlined_kernel
-def _integrate(problem: Problem, path: GyroPath, middle: int, k: int, time: float,
-               sight: _Sight) -> None:
+def _integrate(
+    problem: Problem, path: GyroPath, middle: int, k: int, time: float, sight: _Sight
+) -> None:
     """Fill blur and by_bias of `sight` at a time after knot `k`."""
     dt = time - path.times[k]
     half_share = 0.5 * dt / (path.times[k + 1] - path.times[k])
     for i in range(3):
         change = problem.blur_rates[k + 1, i] - problem.blur_rates[k, i]
         sight.blur[i] = problem.blur_turns[k, i] + dt * (
-            problem.blur_rates[k, i] + half_share * change)
+            problem.blur_rates[k, i] + half_share * change
+        )
         for j in range(3):
-            sight.by_bias[i, j] = (path.turned[k, i, j] - path.turned[middle, i, j]
-                                   + dt * path.rotations[k, i, j])
+            sight.by_bias[i, j] = (
+                path.turned[k, i, j] - path.turned[middle, i, j] + dt * path.rotations[k, i, j]
+            )
 
 
 @inlined_kernel
@@ -344,8 +399,14 @@ def _add_match(J: Array, r: float, weight: float, gradient: Array, hessian: Arra
 
 
 @kernel
-def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Array,
-               derivatives: bool, sums: Sums) -> None:
+def accumulate(
+    problem: Problem,
+    path: GyroPath,
+    unknowns: Unknowns,
+    tangent: Array,
+    derivatives: bool,
+    sums: Sums,
+) -> None:
     """Sum robust losses, gradients and Hessians over the matches of each pair, without priors.
 
     `tangent` (P, 2, 3) spans the steps of each direction. With ``d = r / noise`` and
@@ -369,12 +430,13 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
         for n in range(problem.begin[p], problem.begin[p + 1]):
             row1, row2 = problem.rows[0, n], problem.rows[1, n]
             t1, t2 = starts[0] + row1 * readout, starts[1] + row2 * readout
-            k1, m1 = _look(path, unknowns.R_imu_cam, half_back, problem.points[0, n], t1, k1,
-                           sight1)
+            k1, m1 = _look(
+                path, unknowns.R_imu_cam, half_back, problem.points[0, n], t1, k1, sight1
+            )
             k2, m2 = _look(path, unknowns.R_imu_cam, half, problem.points[1, n], t2, k2, sight2)
             rows = row1 + row2
-            b = _less(straight, -rows, bend, 1.0)   # straight + rows bend
-            c1, c2 = cross(m2, b), cross(b, m1)     # e = m_1 . c_1 = m_2 . c_2
+            b = _less(straight, -rows, bend, 1.0)  # straight + rows bend
+            c1, c2 = cross(m2, b), cross(b, m1)  # e = m_1 . c_1 = m_2 . c_2
             square1, by_pixels1 = _by_pixels(sight1.M, problem.by_pixel[0, n], c1)
             square2, by_pixels2 = _by_pixels(sight2.M, problem.by_pixel[1, n], c2)
             s = math.sqrt(max(square1 + square2, 1e-16))
@@ -385,7 +447,8 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
             if not derivatives:
                 continue
             by_m1, by_m2, by_1, by_2, by_b = _derivatives(
-                r, s, m1, m2, b, c1, c2, by_pixels1, by_pixels2)
+                r, s, m1, m2, b, c1, c2, by_pixels1, by_pixels2
+            )
             J[:] = 0.0
             _integrate(problem, path, middle, k1, t1, sight1)
             _integrate(problem, path, middle, k2, t2, sight2)
@@ -401,8 +464,9 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
 
 
 @kernel
-def eliminate(sums: Sums, prior: Array, damping: Array, score: Array, reduced: Array,
-              back: Array) -> None:
+def eliminate(
+    sums: Sums, prior: Array, damping: Array, score: Array, reduced: Array, back: Array
+) -> None:
     """Fill the normal equations of the parameters, and how the pairs' own unknowns follow them.
 
     With ``H_ll + prior = L L^T`` (diagonal times ``1 + damping``) and ``Y = L^-1 [H_lg, g_l]``:
@@ -443,8 +507,9 @@ def eliminate(sums: Sums, prior: Array, damping: Array, score: Array, reduced: A
 
 
 @kernel
-def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
-                    chosen: NDArray[np.int64]) -> None:
+def find_directions(
+    problem: Problem, path: GyroPath, unknowns: Unknowns, chosen: NDArray[np.int64]
+) -> None:
     """Replace each direction by the best of itself and of those that two matches each fix.
 
     `chosen` (K, 2) are large random numbers that pick the matches. The best has the least sum of
@@ -481,8 +546,9 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
 
 
 @kernel
-def _constraints(problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, normals: Array,
-                 squares: Array) -> None:
+def _constraints(
+    problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, normals: Array, squares: Array
+) -> None:
     """Fill `normals` and `squares` of the matches of a pair."""
     parameters = unknowns.parameters
     uncorrected, sight1, sight2 = np.eye(3), _new_sight(), _new_sight()
@@ -490,10 +556,24 @@ def _constraints(problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, n
     k1 = k2 = problem.middle[p]
     for i in range(problem.begin[p + 1] - problem.begin[p]):
         n = problem.begin[p] + i
-        k1, m1 = _look(path, unknowns.R_imu_cam, uncorrected, problem.points[0, n],
-                       starts[0] + problem.rows[0, n] * parameters[READOUT], k1, sight1)
-        k2, m2 = _look(path, unknowns.R_imu_cam, uncorrected, problem.points[1, n],
-                       starts[1] + problem.rows[1, n] * parameters[READOUT], k2, sight2)
+        k1, m1 = _look(
+            path,
+            unknowns.R_imu_cam,
+            uncorrected,
+            problem.points[0, n],
+            starts[0] + problem.rows[0, n] * parameters[READOUT],
+            k1,
+            sight1,
+        )
+        k2, m2 = _look(
+            path,
+            unknowns.R_imu_cam,
+            uncorrected,
+            problem.points[1, n],
+            starts[1] + problem.rows[1, n] * parameters[READOUT],
+            k2,
+            sight2,
+        )
         normals[i, 0], normals[i, 1], normals[i, 2] = cross(m1, m2)
         squares[i] = 0.0
         _add_squares(problem.by_pixel[0, n], sight1.M, m2, squares[i])

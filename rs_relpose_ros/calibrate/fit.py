@@ -41,8 +41,7 @@ def stretches(times: Array) -> NDArray[np.int64]:
     return np.minimum(((times - begin) / duration * count).astype(np.int64), count - 1)
 
 
-def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
-              prior: Array) -> Array:
+def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior: Array) -> Array:
     """Covariance (G, G) by deleting a group each: one Newton step from the optimum.
 
     Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the few
@@ -51,9 +50,13 @@ def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
     inverse variances that count as known.
     """
     total = curvatures.sum(axis=0) + np.diag(prior)
-    moves = np.stack([
-        np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
-        @ scores[groups == name].sum(axis=0) for name in np.unique(groups)])
+    moves = np.stack(
+        [
+            np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
+            @ scores[groups == name].sum(axis=0)
+            for name in np.unique(groups)
+        ]
+    )
     inverse = np.linalg.pinv(total, hermitian=True)
     return jackknife_of(moves) + inverse @ np.diag(prior) @ inverse
 
@@ -82,23 +85,42 @@ _DAMPING = (1e-6, 1e3)
 _NOISE_RANGE = (0.6, 4.0)
 
 
-def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
-            bias: Array | float = 0.0, noise: float = _NOISE_AT_START) -> Unknowns:
+def initial(
+    problem: Problem,
+    R_imu_cam: Array,
+    offset: float,
+    readout: float = 0.0,
+    bias: Array | float = 0.0,
+    noise: float = _NOISE_AT_START,
+) -> Unknowns:
     """A calibration with the assumed lens, and the most likely directions of the pairs."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
     parameters[[READOUT, model.OFFSET]] = readout, offset
-    parameters[model.BIAS:model.FOCAL] = bias
+    parameters[model.BIAS : model.FOCAL] = bias
     # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
-    return redirected(problem, Unknowns(
-        parameters, np.ascontiguousarray(R_imu_cam), np.tile(np.eye(9)[0], (pairs, 1)),
-        np.full(pairs, noise), np.full(pairs, _DAMPING[0])))
+    return redirected(
+        problem,
+        Unknowns(
+            parameters,
+            np.ascontiguousarray(R_imu_cam),
+            np.tile(np.eye(9)[0], (pairs, 1)),
+            np.full(pairs, noise),
+            np.full(pairs, _DAMPING[0]),
+        ),
+    )
 
 
 def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unknowns:
     """The calibration for other pairs, about its own lens, with a multiple of its median noise."""
     p = unknowns.parameters
-    return initial(problem, unknowns.R_imu_cam, p[model.OFFSET], p[READOUT],
-                   p[model.BIAS:model.FOCAL], caution * float(np.median(unknowns.noise)))
+    return initial(
+        problem,
+        unknowns.R_imu_cam,
+        p[model.OFFSET],
+        p[READOUT],
+        p[model.BIAS : model.FOCAL],
+        caution * float(np.median(unknowns.noise)),
+    )
 
 
 _STAY = np.zeros((1, LOCAL))
@@ -107,15 +129,17 @@ _STAY = np.zeros((1, LOCAL))
 def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
-    parameters[ROTATION:model.BIAS] = 0.0
-    rotation = Rotation.from_rotvec(step[ROTATION:model.BIAS]).as_matrix()
+    parameters[ROTATION : model.BIAS] = 0.0
+    rotation = Rotation.from_rotvec(step[ROTATION : model.BIAS]).as_matrix()
     # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
     direction = unknowns.own[:, :3] + np.einsum('pk,pki->pi', along, _tangents(unknowns))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return unknowns._replace(
-        parameters=parameters, R_imu_cam=rotation @ unknowns.R_imu_cam,
-        own=np.hstack([direction, unknowns.own[:, 3:] + local[:, 2:]]))
+        parameters=parameters,
+        R_imu_cam=rotation @ unknowns.R_imu_cam,
+        own=np.hstack([direction, unknowns.own[:, 3:] + local[:, 2:]]),
+    )
 
 
 def _tangents(unknowns: Unknowns) -> Array:
@@ -131,11 +155,11 @@ def _tangents(unknowns: Unknowns) -> Array:
 class Evaluation:
     """Cost of all pairs, and, if requested, their normal equations without their own unknowns."""
 
-    losses: Array       # (P,) robust losses of the matches and the prior of the pair
-    residuals: Array    # (N,) [px]
-    score: Array        # (P, GLOBAL) gradient by the parameters
-    reduced: Array      # (P, GLOBAL, GLOBAL) Hessian by the parameters
-    back: Array         # (P, LOCAL, GLOBAL + 1) H_ll^-1 [H_lg, g_l]
+    losses: Array  # (P,) robust losses of the matches and the prior of the pair
+    residuals: Array  # (N,) [px]
+    score: Array  # (P, GLOBAL) gradient by the parameters
+    reduced: Array  # (P, GLOBAL, GLOBAL) Hessian by the parameters
+    back: Array  # (P, LOCAL, GLOBAL + 1) H_ll^-1 [H_lg, g_l]
 
     @property
     def cost(self) -> float:
@@ -164,10 +188,20 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
 
 def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums:
     size = problem.pairs if derivatives else 0
-    sums = model.Sums(np.empty(problem.pairs), np.empty(len(problem.rows[0])),
-                      np.zeros((size, model.ALL)), np.zeros((size, model.ALL, model.ALL)))
-    model.accumulate(_through_lens(problem, unknowns), _path(problem, unknowns), unknowns,
-                     _tangents(unknowns), derivatives, sums)
+    sums = model.Sums(
+        np.empty(problem.pairs),
+        np.empty(len(problem.rows[0])),
+        np.zeros((size, model.ALL)),
+        np.zeros((size, model.ALL, model.ALL)),
+    )
+    model.accumulate(
+        _through_lens(problem, unknowns),
+        _path(problem, unknowns),
+        unknowns,
+        _tangents(unknowns),
+        derivatives,
+        sums,
+    )
     return sums
 
 
@@ -176,34 +210,53 @@ def _evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evalu
     size, weights = len(sums.gradient), _local_priors(problem)
     own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.own[:, 3:]])
     result = Evaluation(
-        sums.losses + 0.5 * (weights * own**2).sum(axis=1), sums.residuals,
-        np.empty((size, GLOBAL)), np.empty((size, GLOBAL, GLOBAL)),
-        np.empty((size, LOCAL, GLOBAL + 1)))
+        sums.losses + 0.5 * (weights * own**2).sum(axis=1),
+        sums.residuals,
+        np.empty((size, GLOBAL)),
+        np.empty((size, GLOBAL, GLOBAL)),
+        np.empty((size, LOCAL, GLOBAL + 1)),
+    )
     if size:
         gradient = sums.gradient.copy()
         gradient[:, GLOBAL:] += weights * own
-        model.eliminate(sums._replace(gradient=gradient), weights, unknowns.damping,
-                        result.score, result.reduced, result.back)
+        model.eliminate(
+            sums._replace(gradient=gradient),
+            weights,
+            unknowns.damping,
+            result.score,
+            result.reduced,
+            result.back,
+        )
     return result
 
 
 def _local_priors(problem: Problem) -> Array:
     """Inverse variances (P, LOCAL); the 1 keeps a direction that no match determines."""
-    return np.ascontiguousarray(np.repeat(
-        [np.ones(problem.pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
-        [2, 3, 3], axis=0).T)
+    return np.ascontiguousarray(
+        np.repeat(
+            [np.ones(problem.pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
+            [2, 3, 3],
+            axis=0,
+        ).T
+    )
 
 
 def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
     """Problem with priors of `bend` from the parallax per second of the matches."""
     path, parameters = _path(problem, unknowns), unknowns.parameters
     rays = []
-    for times, rows, points in zip(problem.times, problem.rows,
-                                   _through_lens(problem, unknowns).points, strict=True):
+    for times, rows, points in zip(
+        problem.times, problem.rows, _through_lens(problem, unknowns).points, strict=True
+    ):
         at = times[problem.pair] + parameters[model.OFFSET] + parameters[READOUT] * rows
         directions = np.column_stack([points, np.ones(len(points))])
-        rays.append(np.einsum('nij,nj->ni', path.at(at) @ unknowns.R_imu_cam,
-                              directions / np.linalg.norm(directions, axis=1)[:, None]))
+        rays.append(
+            np.einsum(
+                'nij,nj->ni',
+                path.at(at) @ unknowns.R_imu_cam,
+                directions / np.linalg.norm(directions, axis=1)[:, None],
+            )
+        )
     angles = _medians(problem, np.linalg.norm(np.cross(rays[0], rays[1]), axis=1))
     passing = np.maximum(angles / (problem.times[1] - problem.times[0]), 1e-6)
     return problem._replace(bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
@@ -214,21 +267,25 @@ def _through_lens(problem: Problem, unknowns: Unknowns) -> Problem:
     lens = unknowns.parameters[model.LENS]
     if not lens.any():
         return problem
-    return problem._replace(points=problem.points + problem.by_lens @ lens,
-                            by_pixel=problem.by_pixel + problem.by_pixel_by_lens @ lens)
+    return problem._replace(
+        points=problem.points + problem.by_lens @ lens,
+        by_pixel=problem.by_pixel + problem.by_pixel_by_lens @ lens,
+    )
 
 
 def _medians(problem: Problem, values: Array) -> Array:
     """Median (P,) over the matches of each pair of values (N,)."""
-    return np.array([np.median(values[begin:end])
-                     for begin, end in itertools.pairwise(problem.begin)])
+    return np.array(
+        [np.median(values[begin:end]) for begin, end in itertools.pairwise(problem.begin)]
+    )
 
 
 def _path(problem: Problem, unknowns: Unknowns) -> model.GyroPath:
     parameters = unknowns.parameters
     estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
-    return model.GyroPath.integrated(problem.gyro_times, estimated,
-                                     parameters[model.BIAS:model.FOCAL])
+    return model.GyroPath.integrated(
+        problem.gyro_times, estimated, parameters[model.BIAS : model.FOCAL]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,15 +294,21 @@ class Fit:
 
     problem: Problem
     unknowns: Unknowns
-    free: NDArray[np.bool_]   # (GLOBAL,) parameters that were fitted
-    weights: Array        # (N,) of the matches, 1 where the residual is 0
-    covariance: Array     # (GLOBAL, GLOBAL), zero rows and columns where a parameter was held
-    information: Array    # (GLOBAL, GLOBAL) the Hessian, before any prior
+    free: NDArray[np.bool_]  # (GLOBAL,) parameters that were fitted
+    weights: Array  # (N,) of the matches, 1 where the residual is 0
+    covariance: Array  # (GLOBAL, GLOBAL), zero rows and columns where a parameter was held
+    information: Array  # (GLOBAL, GLOBAL) the Hessian, before any prior
     converged: bool
 
 
-def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds: int = 60,
-        tolerance: float = 0.05) -> Fit:
+def fit(
+    problem: Problem,
+    unknowns: Unknowns,
+    free: NDArray[np.bool_],
+    *,
+    rounds: int = 60,
+    tolerance: float = 0.05,
+) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and estimate the noise meanwhile.
 
     Newton steps shorter than `tolerance` [sigma of the parameters] end the fit. After `rounds`
@@ -267,8 +330,11 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
         unknowns = at.unknowns._replace(noise=noise)
         if change > 0.1:
             # The cost is not convex in the directions: less noise distinguishes more of them.
-            unknowns = _chosen(problem, _settled(problem, redirected(problem, unknowns)),
-                               _settled(problem, unknowns))[0]
+            unknowns = _chosen(
+                problem,
+                _settled(problem, redirected(problem, unknowns)),
+                _settled(problem, unknowns),
+            )[0]
         at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton), at.damping)
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
@@ -276,16 +342,21 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
     weights = np.asarray((1.0 + (evaluation.residuals / limits) ** 2) ** -2)
     covariance = np.zeros((GLOBAL, GLOBAL))
     covariance[np.ix_(free, free)] = jackknife(
-        evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
-        stretches(problem.middles), problem.prior[free])
+        evaluation.score[:, free],
+        bent(weights) * evaluation.reduced[:, free][:, :, free],
+        stretches(problem.middles),
+        problem.prior[free],
+    )
     if not converged:
         covariance[np.ix_(free, free)] += _MOST_GAIN**2 * np.outer(at.newton, at.newton)
-    return Fit(problem, unknowns, free, weights, covariance, evaluation.reduced.sum(axis=0),
-               converged)
+    return Fit(
+        problem, unknowns, free, weights, covariance, evaluation.reduced.sum(axis=0), converged
+    )
 
 
-def cost_curve(problem: Problem, final: Fit, interval: float,
-               progress: Callable[[float], object]) -> Array:
+def cost_curve(
+    problem: Problem, final: Fit, interval: float, progress: Callable[[float], object]
+) -> Array:
     """Readout times from an interval upwards to one downwards, and the costs with each (2, K)."""
     best = float(final.unknowns.parameters[READOUT])
     held = final.free.copy()
@@ -303,14 +374,16 @@ def cost_curve(problem: Problem, final: Fit, interval: float,
             costs[k] = evaluate(problem, unknowns, derivatives=False).cost
             progress(float(np.isfinite(costs).mean()))
     # A match of a frame is in many pairs: scaled to the curvature 1 / sigma^2 at the minimum.
-    information = (final.information * (problem.begin[-1] / final.problem.begin[-1])
-                   + np.diag(problem.prior))[np.ix_(final.free, final.free)]
+    information = (
+        final.information * (problem.begin[-1] / final.problem.begin[-1]) + np.diag(problem.prior)
+    )[np.ix_(final.free, final.free)]
     naive = float(np.linalg.inv(information)[0, 0])
     return np.array([values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
 
 
-def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
-              rounds: int) -> Unknowns:
+def _refitted(
+    problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], rounds: int
+) -> Unknowns:
     """Unknowns after plain Gauss-Newton steps."""
     for _ in range(rounds):
         evaluation = evaluate(problem, unknowns)
@@ -321,12 +394,14 @@ def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
     return unknowns
 
 
-def _normal_equations(problem: Problem, evaluation: Evaluation, unknowns: Unknowns,
-                      free: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _normal_equations(
+    problem: Problem, evaluation: Evaluation, unknowns: Unknowns, free: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Hessian and gradient of the cost with its prior by the free parameters."""
     H = evaluation.reduced.sum(axis=0) + np.diag(problem.prior)
     gradient = evaluation.score.sum(axis=0) + problem.prior * (
-        unknowns.parameters - problem.center)
+        unknowns.parameters - problem.center
+    )
     return H[np.ix_(free, free)], gradient[free]
 
 
@@ -347,7 +422,8 @@ def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns
     better = losses <= others
     unknowns = moved._replace(
         own=np.where(better[:, None], moved.own, kept.own),
-        damping=np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING))
+        damping=np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING),
+    )
     return unknowns, float(np.minimum(losses, others).sum())
 
 
@@ -356,16 +432,17 @@ class _Iterate(NamedTuple):
 
     unknowns: Unknowns
     evaluation: Evaluation
-    newton: Array               # Newton's step to here, of the free parameters
-    damping: float = 1e-3       # Levenberg-Marquardt's, of the calibration's parameters
-    length: float = math.inf    # of `newton` [sigma]
-    gain: float = 1.0           # step taken, over `newton`
+    newton: Array  # Newton's step to here, of the free parameters
+    damping: float = 1e-3  # Levenberg-Marquardt's, of the calibration's parameters
+    length: float = math.inf  # of `newton` [sigma]
+    gain: float = 1.0  # step taken, over `newton`
 
 
 def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
     """State after a step that lowers the cost; the same if none does."""
+
     def prior_cost(unknowns: Unknowns) -> float:
-        return 0.5 * float(problem.prior @ (unknowns.parameters - problem.center)**2)
+        return 0.5 * float(problem.prior @ (unknowns.parameters - problem.center) ** 2)
 
     cost = at.evaluation.cost + prior_cost(at.unknowns)
     H, gradient = _normal_equations(problem, at.evaluation, at.unknowns, free)
@@ -394,11 +471,15 @@ def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
     """Noise (P,) of each pair by its residuals [px]; a third of the last at least."""
     counts = np.diff(problem.begin)
     # Some two unknowns of each pair hide a part of it.
-    noise = 1.4826 * _medians(problem, np.abs(at.evaluation.residuals)) * np.sqrt(
-        counts / np.maximum(counts - 3.0, 1.0))
+    noise = (
+        1.4826
+        * _medians(problem, np.abs(at.evaluation.residuals))
+        * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
+    )
     middle = max(float(np.median(noise)), _LEAST_NOISE)
-    return np.maximum(np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle),
-                      at.unknowns.noise / 3.0)
+    return np.maximum(
+        np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle), at.unknowns.noise / 3.0
+    )
 
 
 def bent(weights: Array) -> float:
@@ -418,13 +499,13 @@ _CHANCE, _GROSS = 1.75, 9.0
 class ModelErrors(NamedTuple):
     """Deviations of lens and gyro from their model, 1 sigma each."""
 
-    focal: float = 0.005        # focal length, relative
-    aspect: float = 0.002       # ratio of the two focal lengths
-    center: float = 0.005       # principal point, share of the image's width
-    radial: float = 0.02        # first coefficient of the distortion
-    second: float = 0.0         # second coefficient, r^4
-    gyro_scale: float = 0.005   # of each axis, relative
-    gyro_skew: float = 0.005    # between each two axes [rad]
+    focal: float = 0.005  # focal length, relative
+    aspect: float = 0.002  # ratio of the two focal lengths
+    center: float = 0.005  # principal point, share of the image's width
+    radial: float = 0.02  # first coefficient of the distortion
+    second: float = 0.0  # second coefficient, r^4
+    gyro_scale: float = 0.005  # of each axis, relative
+    gyro_skew: float = 0.005  # between each two axes [rad]
 
 
 # Beyond an estimated lens: of the focal length, the first coefficient and the principal point.
@@ -439,8 +520,10 @@ def widened(final: Fit, errors: ModelErrors | None) -> Fit:
         # One Newton step from the optimum with each error.
         here = evaluate(final.problem, final.unknowns)
         H, _ = _normal_equations(final.problem, here, final.unknowns, final.free)
-        gradients = [(evaluate(*there).score - here.score).sum(axis=0)[final.free]
-                     for there in _perturbed(final, errors)]
+        gradients = [
+            (evaluate(*there).score - here.score).sum(axis=0)[final.free]
+            for there in _perturbed(final, errors)
+        ]
         moves = np.linalg.solve(H, np.transpose(gradients))
         scatter[np.ix_(final.free, final.free)] += moves @ moves.T
     return replace(final, covariance=scatter)
@@ -462,9 +545,14 @@ def _between_regions(final: Fit) -> Array:
     moves, cells = [], np.zeros_like(inverse)
     for name in np.unique(region):
         of_region = _sums(problem.matches(region == name), final.unknowns, derivatives=True)
-        rest = _evaluation(problem, final.unknowns, sums._replace(
-            gradient=sums.gradient - of_region.gradient,
-            hessian=sums.hessian - of_region.hessian))
+        rest = _evaluation(
+            problem,
+            final.unknowns,
+            sums._replace(
+                gradient=sums.gradient - of_region.gradient,
+                hessian=sums.hessian - of_region.hessian,
+            ),
+        )
         own = (whole.score - rest.score)[:, free]
         rest_curvature = (curve * rest.reduced.sum(axis=0) + prior)[index]
         moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
@@ -478,9 +566,11 @@ def _between_regions(final: Fit) -> Array:
 
 def _regions(points: Array) -> NDArray[np.int64]:
     """Region (N,) of the image of each point (N, 2): columns and rows of equally many points."""
+
     def band(values: Array, count: int) -> NDArray[np.int64]:
         borders = np.quantile(values, np.arange(1, count) / count)
         return np.searchsorted(borders, values)
+
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
 
 
@@ -490,17 +580,22 @@ def _disagreement(final: Fit) -> Array:
     first = middles < np.median(middles)
     one, other = (
         fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
-        for part in (first, ~first))
+        for part in (first, ~first)
+    )
     difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION:model.BIAS] = log_so3(one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
+    difference[ROTATION : model.BIAS] = log_so3(
+        one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T
+    )
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
-    variances = np.maximum(np.diag(one.covariance + other.covariance),
-                           2.0 * np.diag(final.covariance))
-    squares = difference[free]**2 / variances[free]
+    variances = np.maximum(
+        np.diag(one.covariance + other.covariance), 2.0 * np.diag(final.covariance)
+    )
+    squares = difference[free] ** 2 / variances[free]
     mean = float(np.minimum(squares, _GROSS).mean())
     factors = np.ones(GLOBAL)
-    factors[free] = np.maximum(mean if mean > _CHANCE else 1.0,
-                               np.where(squares > _GROSS, squares, 1.0))
+    factors[free] = np.maximum(
+        mean if mean > _CHANCE else 1.0, np.where(squares > _GROSS, squares, 1.0)
+    )
     return factors
 
 
@@ -508,15 +603,18 @@ def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unkno
     """Data and unknowns with one sigma of each error of the model."""
     problem, unknowns = final.problem, final.unknowns
     center = errors.center * float(
-        np.ptp(problem.points[0, :, 0]) / np.mean(problem.by_pixel[0, :, 0, 0]))
+        np.ptp(problem.points[0, :, 0]) / np.mean(problem.by_pixel[0, :, 0, 0])
+    )
     for k, error in enumerate((errors.focal, errors.radial, center, center)):
         if error:
             parameters = unknowns.parameters.copy()
             parameters[model.FOCAL + k] += error
             yield problem, unknowns._replace(parameters=parameters)
     squares = (problem.points**2).sum(axis=2, keepdims=True)
-    for points in (problem.points / [1.0, 1.0 + errors.aspect],
-                   problem.points * (1.0 - errors.second * squares**2)):
+    for points in (
+        problem.points / [1.0, 1.0 + errors.aspect],
+        problem.points * (1.0 - errors.second * squares**2),
+    ):
         yield problem._replace(points=points), unknowns
     for i in range(3):
         for j in range(i + 1):
@@ -535,7 +633,8 @@ def move_of_poses(final: Fit, covariance: Array) -> float:
     H = sums.hessian[:, GLOBAL:, GLOBAL:]
     H = H + np.tril(H, -1).swapaxes(1, 2) + _local_priors(problem)[:, :, None] * np.eye(LOCAL)
     back = _evaluation(problem, final.unknowns, sums).back[:, :2, :GLOBAL]
-    move, own = (float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
-                 for of_pairs in (back @ covariance @ back.swapaxes(1, 2),
-                                  np.linalg.inv(H)[:, :2, :2]))
+    move, own = (
+        float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
+        for of_pairs in (back @ covariance @ back.swapaxes(1, 2), np.linalg.inv(H)[:, :2, :2])
+    )
     return move / min(own, _KNOWN_DIRECTION)

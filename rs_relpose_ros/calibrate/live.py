@@ -51,18 +51,19 @@ class LiveCalibration:
     a fit. `topic`: of the images. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
     """
 
-    camera_info_problem = ''   # an uncalibrated CameraInfo is none: the lens is calibrated, too
+    camera_info_problem = ''  # an uncalibrated CameraInfo is none: the lens is calibrated, too
 
-    def __init__(self, parameters: Parameters, *, use_stored: bool, waits_for: str = '',
-                 topic: str = '') -> None:
+    def __init__(
+        self, parameters: Parameters, *, use_stored: bool, waits_for: str = '', topic: str = ''
+    ) -> None:
         self._parameters, self._topic = parameters, topic
         self._use_stored, self.waits_for = use_stored, waits_for
         self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
         # Images put into the queue by `receive`, or not, and taken by `step`: a thread each.
         self._put = self._left_out = self._taken = 0
-        self._image_s = 0.0   # time of the last image on the monotonic clock
-        self._short = 0.0   # length of a recording that was reported as too short [s]
+        self._image_s = 0.0  # time of the last image on the monotonic clock
+        self._short = 0.0  # length of a recording that was reported as too short [s]
         self._done = False
         self._camera: CameraId | None = None
         self._fits: _Fits | None = None
@@ -72,7 +73,7 @@ class LiveCalibration:
         self.close()
         self._recorder = Recorder(self._parameters.tracking, _LONGEST)
         self._images = self._refused = 0
-        self._fitted_ns = 0   # stamp of the last image at the begin of the last fit
+        self._fitted_ns = 0  # stamp of the last image at the begin of the last fit
 
     @property
     def intrinsics(self) -> Intrinsics | None:
@@ -103,8 +104,9 @@ class LiveCalibration:
 
     def counts(self) -> SequencerCounts:
         """Images that were used and left out."""
-        return SequencerCounts(self._put + self._left_out, self._taken,
-                               Counter({Refusal.OVERLOAD: self._left_out}))
+        return SequencerCounts(
+            self._put + self._left_out, self._taken, Counter({Refusal.OVERLOAD: self._left_out})
+        )
 
     def step(self, timeout: float = 0.0) -> Progress | Calibrated | RsRelposeError | None:
         """Use a message; the state after a fit, the error of the message, or None."""
@@ -151,12 +153,17 @@ class LiveCalibration:
 
     def _too_short(self) -> Progress | None:
         seconds = self._recorder.seconds
-        if (not self._short < seconds < _FIRST or self.waits_for
-                or time.monotonic() - self._image_s < _SILENCE):
+        if (
+            not self._short < seconds < _FIRST
+            or self.waits_for
+            or time.monotonic() - self._image_s < _SILENCE
+        ):
             return None
         self._short = seconds
-        return Progress(f'calibrating: the images ended after {seconds:.1f} s, too short: '
-                        f'at least {_FIRST:.0f} s are needed, 10 s or more are good')
+        return Progress(
+            f'calibrating: the images ended after {seconds:.1f} s, too short: '
+            f'at least {_FIRST:.0f} s are needed, 10 s or more are good'
+        )
 
     def close(self) -> None:
         """End the process of the fits."""
@@ -167,20 +174,29 @@ class LiveCalibration:
     def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
         """The stored calibration of the camera, if there is one, or the error of its file."""
         config, size = self._parameters.calibration, self._recorder.size
-        self._camera = (CameraId(config.camera_name, *size) if config.camera_name
-                        else CameraId(frame_id, *size, self._topic))
+        self._camera = (
+            CameraId(config.camera_name, *size)
+            if config.camera_name
+            else CameraId(frame_id, *size, self._topic)
+        )
         try:
             path = stored.path_of(config, self._camera)
             if self._use_stored and path.is_file():
                 _, known = stored.load(path, self._camera)
-                return Calibrated(self._camera, path.read_text(encoding='utf-8'),
-                                  f'using the calibration of {known} in {path}', new=False)
+                return Calibrated(
+                    self._camera,
+                    path.read_text(encoding='utf-8'),
+                    f'using the calibration of {known} in {path}',
+                    new=False,
+                )
         except RsRelposeError as error:
             return error
         self._fits = None if self.waits_for else _Fits()
-        return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
-                        'for some 20 s' if not self.waits_for else
-                        f'waiting for {self.waits_for}')
+        return Progress(
+            'calibrating: rotate the camera about all three axes, 20 to 60 deg/s, for some 20 s'
+            if not self.waits_for
+            else f'waiting for {self.waits_for}'
+        )
 
     def _after_fit(self) -> Progress | Calibrated | None:
         fits = self._fits
@@ -195,9 +211,13 @@ class LiveCalibration:
             return None
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor
-        config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
-                         exposure_margin=sensor.exposure_margin, tolerance=_WIDER,
-                         unnoticed_tolerance=_UNNOTICED)
+        config = replace(
+            TRACKED_IN_IMAGES,
+            exposure_time=sensor.exposure_time,
+            exposure_margin=sensor.exposure_margin,
+            tolerance=_WIDER,
+            unnoticed_tolerance=_UNNOTICED,
+        )
         if recorder.seconds >= _WHEELS and self.quat_prior is not None:
             config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA / _WIDER)
         if fits is None or fits.process.poll() is not None:
@@ -209,8 +229,9 @@ class LiveCalibration:
             return Progress(f'calibrating: {error}')
         return None
 
-    def _evaluated(self, result: CalibrationResult | RsRelposeError,
-                   recording: CalibrationInput) -> Progress | Calibrated:
+    def _evaluated(
+        self, result: CalibrationResult | RsRelposeError, recording: CalibrationInput
+    ) -> Progress | Calibrated:
         seconds = 1e-9 * (recording.tracks.stamps_ns[-1] - recording.tracks.stamps_ns[0])
         if isinstance(result, RsRelposeError):
             return Progress(f'calibrating, {seconds:.0f} s: {result}')
@@ -218,14 +239,21 @@ class LiveCalibration:
         known = '; '.join(f'{name} {text}' for name, text, of in rows if of in result.needed)
         if result.observable:
             assert self._camera is not None
-            return Calibrated(self._camera, parameter_file(
-                result, f'Calibration of {self._camera.name} by {seconds:.0f} s while running.',
-                camera=recording.camera), f'calibrated: {known}')
+            return Calibrated(
+                self._camera,
+                parameter_file(
+                    result,
+                    f'Calibration of {self._camera.name} by {seconds:.0f} s while running.',
+                    camera=recording.camera,
+                ),
+                f'calibrated: {known}',
+            )
         missing = [of.remark for of in result.needed if not of.observable]
         return Progress(
             f'calibrating, {seconds:.0f} s: {known}. Needed: {"; ".join(dict.fromkeys(missing))}',
             1.0 - len(missing) / len(result.needed),
-            {name: text if of.observable else f'{text}; {of.remark}' for name, text, of in rows})
+            {name: text if of.observable else f'{text}; {of.remark}' for name, text, of in rows},
+        )
 
 
 class _Fits:
@@ -236,10 +264,11 @@ class _Fits:
     """
 
     def __init__(self) -> None:
-        self.recording: CalibrationInput | None = None   # while its fit runs
+        self.recording: CalibrationInput | None = None  # while its fit runs
         self.found: Future[CalibrationResult | RsRelposeError] = Future()
-        self.process = subprocess.Popen([sys.executable, '-m', __name__], stdin=subprocess.PIPE,
-                                        stdout=subprocess.PIPE)
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         self._thread = ThreadPoolExecutor(1)
 
     def begin(self, recording: CalibrationInput, *others: Any) -> None:
@@ -251,9 +280,9 @@ class _Fits:
         requests, answers = self.process.stdin, self.process.stdout
         assert requests is not None and answers is not None
         try:
-            pickle.dump(arguments, requests, protocol=5)   # without copies of the arrays
+            pickle.dump(arguments, requests, protocol=5)  # without copies of the arrays
             requests.flush()
-            found: CalibrationResult | RsRelposeError = pickle.load(answers)   # noqa: S301
+            found: CalibrationResult | RsRelposeError = pickle.load(answers)  # noqa: S301
         except (OSError, EOFError, pickle.UnpicklingError):
             self.process.kill()
             found = RsRelposeError('the process of the fit ended early: out of memory?')
@@ -265,8 +294,8 @@ class _Fits:
         self.process.wait()
         self._thread.shutdown()
         for pipe in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):   # the rest of a request
-                pipe.close()   # type: ignore[union-attr]
+            with suppress(OSError):  # the rest of a request
+                pipe.close()  # type: ignore[union-attr]
 
 
 def _serve() -> None:
@@ -276,7 +305,7 @@ def _serve() -> None:
     while True:
         try:
             recording, config, quat_prior = pickle.load(sys.stdin.buffer)  # noqa: S301 of the node
-        except EOFError:   # the node has ended
+        except EOFError:  # the node has ended
             return
         result: CalibrationResult | RsRelposeError
         try:

@@ -32,10 +32,10 @@ AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 class Tracks:
     """Observations of points over frames."""
 
-    stamps_ns: NDArray[np.int64]    # (F,) of the frames, camera clock, strictly increasing
-    frames: NDArray[np.int64]       # (N,) frame of each observation, not decreasing
-    ids: NDArray[np.int64]          # (N,) its track; at most once per frame
-    points: Array                   # (N, 2) raw (distorted) pixels
+    stamps_ns: NDArray[np.int64]  # (F,) of the frames, camera clock, strictly increasing
+    frames: NDArray[np.int64]  # (N,) frame of each observation, not decreasing
+    ids: NDArray[np.int64]  # (N,) its track; at most once per frame
+    points: Array  # (N, 2) raw (distorted) pixels
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -45,8 +45,8 @@ class Tracks:
 class GyroSeries:
     """Samples of a gyro."""
 
-    stamps_ns: NDArray[np.int64]    # (K,) IMU clock, strictly increasing
-    rates: Array                    # (K, 3) as measured, IMU frame [rad/s]
+    stamps_ns: NDArray[np.int64]  # (K,) IMU clock, strictly increasing
+    rates: Array  # (K, 3) as measured, IMU frame [rad/s]
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -57,7 +57,7 @@ class Pair(NamedTuple):
 
     first: int
     second: int
-    rows: NDArray[np.int64]     # (2, n) observations of the points in both
+    rows: NDArray[np.int64]  # (2, n) observations of the points in both
 
 
 def frames_of(pairs: Sequence[Pair]) -> NDArray[np.int64]:
@@ -68,14 +68,19 @@ def frames_of(pairs: Sequence[Pair]) -> NDArray[np.int64]:
 class PairSelection(NamedTuple):
     """Pairs of frames of a fit."""
 
-    spans: tuple[float, ...]    # time between the frames [s]; of less than a frame: neighbours
-    max_matches: int            # of a pair; drawn from more
-    min_matches: int            # pairs with fewer are left out
-    most_pairs: int             # evenly over the recording
+    spans: tuple[float, ...]  # time between the frames [s]; of less than a frame: neighbours
+    max_matches: int  # of a pair; drawn from more
+    min_matches: int  # pairs with fewer are left out
+    most_pairs: int  # evenly over the recording
 
 
-def make_pairs(tracks: Tracks, gaps: Sequence[int], selection: PairSelection,
-               max_interval: float, rng: np.random.Generator) -> list[Pair]:
+def make_pairs(
+    tracks: Tracks,
+    gaps: Sequence[int],
+    selection: PairSelection,
+    max_interval: float,
+    rng: np.random.Generator,
+) -> list[Pair]:
     """Pairs `gaps` frames apart; none further apart than `max_interval` times the gap [s]."""
     borders = np.searchsorted(tracks.frames, np.arange(len(tracks) + 1))
     order = np.lexsort((tracks.ids, tracks.frames))
@@ -85,14 +90,18 @@ def make_pairs(tracks: Tracks, gaps: Sequence[int], selection: PairSelection,
         if (tracks.stamps_ns[j] - tracks.stamps_ns[i]) * 1e-9 > (j - i) * max_interval:
             continue
         _, *common = np.intersect1d(
-            ids[borders[i]:borders[i + 1]], ids[borders[j]:borders[j + 1]],
-            assume_unique=True, return_indices=True)
+            ids[borders[i] : borders[i + 1]],
+            ids[borders[j] : borders[j + 1]],
+            assume_unique=True,
+            return_indices=True,
+        )
         matches = np.array(common)
         if matches.shape[1] < selection.min_matches:
             continue
         if matches.shape[1] > selection.max_matches:
-            matches = matches[:, rng.choice(matches.shape[1], selection.max_matches,
-                                            replace=False)]
+            matches = matches[
+                :, rng.choice(matches.shape[1], selection.max_matches, replace=False)
+            ]
         pairs.append(Pair(i, j, order[borders[[[i], [j]]] + matches]))
     return pairs
 
@@ -114,7 +123,7 @@ _SMOOTH = 10.0
 class Varying(str, Enum):
     """Why the intervals between frames vary."""
 
-    NOT = 'not'             # all are alike
+    NOT = 'not'  # all are alike
     EXPOSURE = 'exposure'
     JITTER = 'jitter'
     UNCLEAR = 'unclear'
@@ -147,8 +156,10 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     # A smooth line through the stamps less the stamps: straight near each frame.
     times = (stamps_ns - stamps_ns[0]) / NANOSECONDS
     numbers = np.cumsum([0.0, *np.maximum(np.rint(np.diff(times) / median), 1.0)])
-    lines = (polyfit(numbers - number, times, 1,
-                     w=np.exp(-0.25 * ((numbers - number) / _SMOOTH) ** 2)) for number in numbers)
+    lines = (
+        polyfit(numbers - number, times, 1, w=np.exp(-0.25 * ((numbers - number) / _SMOOTH) ** 2))
+        for number in numbers
+    )
     return FrameTimes(Varying.JITTER, np.array([line[0] for line in lines]) - times)
 
 
@@ -163,9 +174,9 @@ _SQUARE = 0.03**2
 class Exposure(NamedTuple):
     """What is known of the exposure of a row before the fit."""
 
-    assumed: Array          # (F,) of each frame [s]
-    square_sigma: float     # 1 sigma of its square [s^2]; 0 if it is given
-    margin: float = 0.0     # frame interval less exposure [s], where it follows the interval
+    assumed: Array  # (F,) of each frame [s]
+    square_sigma: float  # 1 sigma of its square [s^2]; 0 if it is given
+    margin: float = 0.0  # frame interval less exposure [s], where it follows the interval
 
     @classmethod
     def of(cls, times: Array, stamps: FrameTimes, config: CalibrationConfig) -> Exposure:
@@ -191,6 +202,7 @@ def exposed_rates(gyro: GyroSeries, exposure: Array) -> tuple[Array, Array]:
     An image that is exposed for h has the mean over h of the rotation: to second order
     ``w + h^2 / 24 w''`` of the rate w, so that the derivative by h^2 hardly depends on h.
     """
+
     def mean(widths: Array) -> Array:
         # Width zero is the rate itself.
         return mean_rates(gyro.stamps_ns, gyro.rates, gyro.stamps_ns, np.maximum(widths, 1e-6))
@@ -216,9 +228,14 @@ def with_lens(camera: RollingShutterCamera, lens: Array) -> RollingShutterCamera
     """Camera moved by ``[log focal length, first coefficient, principal point (2) [px]]``."""
     counts = DISTORTION_MODELS[camera.distortion_model].coefficient_counts
     first, *others = camera.distortion or (0.0,) * max(counts[0], 4)
-    return replace(camera, fx=camera.fx * math.exp(lens[0]), fy=camera.fy * math.exp(lens[0]),
-                   distortion=(first + float(lens[1]), *others), cx=camera.cx + float(lens[2]),
-                   cy=camera.cy + float(lens[3]))
+    return replace(
+        camera,
+        fx=camera.fx * math.exp(lens[0]),
+        fy=camera.fy * math.exp(lens[0]),
+        distortion=(first + float(lens[1]), *others),
+        cx=camera.cx + float(lens[2]),
+        cy=camera.cy + float(lens[3]),
+    )
 
 
 # Frames further apart than so many intervals have lost some in between.
@@ -247,35 +264,51 @@ _LEAST_COSINE = 0.05
 class Observations:
     """A recording, in seconds since the first frame."""
 
-    tracks: Tracks                  # of points that the camera model can map to rays
-    camera: RollingShutterCamera    # as assumed, moved by `lens`; its readout time is not used
-    lens: Array                     # (4,) as of `with_lens`
-    times: Array                    # (F,) stamps of the frames [s]
+    tracks: Tracks  # of points that the camera model can map to rays
+    camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
+    lens: Array  # (4,) as of `with_lens`
+    times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes
-    exposure: Exposure              # before the fit
-    gyro_times: Array               # (K,) [s]
-    gyro_rates: Array               # (K, 3) mean over the assumed exposure [rad/s]
-    blur_rates: Array               # (K, 3) their derivative by its square [rad/s^3]
-    gyro_density: float             # white noise of the gyro [rad/s/sqrt(Hz)]
+    exposure: Exposure  # before the fit
+    gyro_times: Array  # (K,) [s]
+    gyro_rates: Array  # (K, 3) mean over the assumed exposure [rad/s]
+    blur_rates: Array  # (K, 3) their derivative by its square [rad/s^3]
+    gyro_density: float  # white noise of the gyro [rad/s/sqrt(Hz)]
 
     @classmethod
-    def of(cls, tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera,
-           config: CalibrationConfig | None = None, lens: ArrayLike = (0.0, 0.0, 0.0, 0.0),
-           ) -> Observations:
+    def of(
+        cls,
+        tracks: Tracks,
+        gyro: GyroSeries,
+        camera: RollingShutterCamera,
+        config: CalibrationConfig | None = None,
+        lens: ArrayLike = (0.0, 0.0, 0.0, 0.0),
+    ) -> Observations:
         """Observations of at least two frames and two samples."""
         lens = np.array(lens)
         camera = with_lens(camera, lens)
         rays = camera.unproject(tracks.points)
         ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > _LEAST_COSINE)
-        tracks = replace(tracks, frames=tracks.frames[ahead], ids=tracks.ids[ahead],
-                         points=tracks.points[ahead])
-        times, gyro_times = (np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
-                             for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns))
+        tracks = replace(
+            tracks, frames=tracks.frames[ahead], ids=tracks.ids[ahead], points=tracks.points[ahead]
+        )
+        times, gyro_times = (
+            np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
+            for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns)
+        )
         stamps = frame_times(tracks.stamps_ns)
         exposure = Exposure.of(times, stamps, config or CalibrationConfig())
-        return cls(tracks, camera, lens, times, stamps, exposure, gyro_times,
-                   *exposed_rates(gyro, np.interp(gyro_times, times, exposure.assumed)),
-                   noise_density(gyro_times, gyro.rates))
+        return cls(
+            tracks,
+            camera,
+            lens,
+            times,
+            stamps,
+            exposure,
+            gyro_times,
+            *exposed_rates(gyro, np.interp(gyro_times, times, exposure.assumed)),
+            noise_density(gyro_times, gyro.rates),
+        )
 
     @property
     def interval(self) -> float:
@@ -289,11 +322,13 @@ class Observations:
         rates = rates - rates.mean(axis=0)
         values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
         main, text = vectors[:, 2], ''
-        if np.sqrt(max(values[1], 0.0)) < LEAST_ROTATION:   # two axes fix a rotation
+        if np.sqrt(max(values[1], 0.0)) < LEAST_ROTATION:  # two axes fix a rotation
             first, second, about = (AXES[i] for i in np.argsort(np.abs(main)))
-            text = (f'the camera rotates about one axis only, nearly {about}, so the rotation '
-                    f'about it is not observable: rotate about {first} and {second} too, 20 to 60 '
-                    'deg/s')
+            text = (
+                f'the camera rotates about one axis only, nearly {about}, so the rotation '
+                f'about it is not observable: rotate about {first} and {second} too, 20 to 60 '
+                'deg/s'
+            )
         return np.sqrt((rates**2).mean(axis=0)), text, main
 
     def pairs(self, selection: PairSelection, rng: np.random.Generator) -> list[Pair]:
@@ -301,8 +336,9 @@ class Observations:
         gaps = sorted({max(1, round(span / self.interval)) for span in selection.spans})
         return make_pairs(self.tracks, gaps, selection, _LOST * self.interval, rng)
 
-    def selected_problem(self, selection: PairSelection, offset: float,
-                         rng: np.random.Generator) -> model.Problem:
+    def selected_problem(
+        self, selection: PairSelection, offset: float, rng: np.random.Generator
+    ) -> model.Problem:
         """Data of a fit to pairs all of whose rows lie within the gyro and touch no gap of it.
 
         `offset` [s] is about that of the clocks. InputError if there are fewer than ten pairs.
@@ -317,7 +353,8 @@ class Observations:
             raise InputError(
                 f'only {len(pairs)} pairs of images have {selection.min_matches} points in common '
                 'and a gyro without gaps: record a textured scene with a short exposure, and all '
-                'of the gyro')
+                'of the gyro'
+            )
         most = min(selection.most_pairs, round(_PAIRS_PER_SECOND * self.times[-1]))
         if len(pairs) > most:
             pairs = [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, most)]
@@ -337,10 +374,10 @@ class Observations:
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_ROTATION**2)
         prior, center = np.zeros(model.GLOBAL), np.zeros(model.GLOBAL)
         center[model.LENS] = -self.lens
-        prior[model.BIAS:model.BIAS + 3] = _BIAS_SIGMA**-2
+        prior[model.BIAS : model.BIAS + 3] = _BIAS_SIGMA**-2
         prior[model.SLOPE] = _SLOPE_SIGMA**-2
         prior[model.RADIAL] = _RADIAL_SIGMA**-2
-        prior[model.CENTER:model.CENTER + 2] = (_CENTER_SIGMA * self.camera.width)**-2
+        prior[model.CENTER : model.CENTER + 2] = (_CENTER_SIGMA * self.camera.width) ** -2
         if self.exposure.square_sigma:
             prior[model.EXPOSURE] = self.exposure.square_sigma**-2
         blur_turns = cumulative_trapezoid(self.blur_rates, self.gyro_times, axis=0, initial=0.0)
@@ -353,11 +390,24 @@ class Observations:
             by_lens[..., k] = (moved[0] - points) / step
             by_both[..., k] = (moved[1] - by_pixel) / step
         return model.Problem(
-            self.gyro_times, self.gyro_rates, self.blur_rates, blur_turns,
-            self.times[frames], self.stamps.covariates[frames],
-            np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]), middles,
-            (pixels[:, :, 1] - 0.5 * (height - 1)) / height, points, by_pixel, by_lens, by_both,
-            np.full(len(pairs), _BEND_AT_START), turn_sigma, prior, center)
+            self.gyro_times,
+            self.gyro_rates,
+            self.blur_rates,
+            blur_turns,
+            self.times[frames],
+            self.stamps.covariates[frames],
+            np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]),
+            middles,
+            (pixels[:, :, 1] - 0.5 * (height - 1)) / height,
+            points,
+            by_pixel,
+            by_lens,
+            by_both,
+            np.full(len(pairs), _BEND_AT_START),
+            turn_sigma,
+            prior,
+            center,
+        )
 
 
 def _normalized(camera: RollingShutterCamera, pixels: Array) -> tuple[Array, Array]:
@@ -371,14 +421,19 @@ def _normalized(camera: RollingShutterCamera, pixels: Array) -> tuple[Array, Arr
 
 # -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------
 
+
 @cache
 def axis_maps() -> Array:
     """All 24 rotations (24, 3, 3) that map axes to axes."""
-    maps = np.array([np.diag(signs) @ np.eye(3)[list(columns)] + 0.0    # no zero is negative
-                     for columns in itertools.permutations(range(3))
-                     for signs in itertools.product((1.0, -1.0), repeat=3)])
+    maps = np.array(
+        [
+            np.diag(signs) @ np.eye(3)[list(columns)] + 0.0  # no zero is negative
+            for columns in itertools.permutations(range(3))
+            for signs in itertools.product((1.0, -1.0), repeat=3)
+        ]
+    )
     maps = maps[np.linalg.det(maps) > 0.0]
-    maps.setflags(write=False)      # shared
+    maps.setflags(write=False)  # shared
     return maps
 
 
@@ -393,7 +448,7 @@ def axes_text(axis_map: Array) -> str:
     parts = []
     for row, axis in zip(axis_map, 'xyz', strict=True):
         k = int(np.argmax(np.abs(row)))
-        parts.append(f"cam {axis} = {'-' if row[k] < 0 else '+'}imu {'xyz'[k]}")
+        parts.append(f'cam {axis} = {"-" if row[k] < 0 else "+"}imu {"xyz"[k]}')
     return ', '.join(parts)
 
 
@@ -407,15 +462,23 @@ _ONE_AXIS = 0.05
 class Start(NamedTuple):
     """A coarse calibration."""
 
-    offset: float          # of the middle row [s]: t_imu = stamp + offset
-    R_cam_imu: Array       # (3, 3)
+    offset: float  # of the middle row [s]: t_imu = stamp + offset
+    R_cam_imu: Array  # (3, 3)
     focal_factor: float
-    misfit: float          # share of the variance of the rotation that is not common
+    misfit: float  # share of the variance of the rotation that is not common
 
 
-def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,
-                max_offset: float, focal_factors: Array,
-                R_prior: Array | None = None) -> list[Start]:
+def find_starts(
+    rates: Array,
+    begins: Array,
+    ends: Array,
+    gyro_times: Array,
+    gyro_rates: Array,
+    *,
+    max_offset: float,
+    focal_factors: Array,
+    R_prior: Array | None = None,
+) -> list[Start]:
     """Offsets at which the rotated gyro agrees best with the images; best first.
 
     `rates` (P, 3) of the camera hold between `begins` and `ends` (P,) [s] on its clock. Offsets to
@@ -426,32 +489,51 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
 
     def aligned(offset: float, factors: ArrayLike) -> Start | None:
-        inside = ((begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1]))
+        inside = (begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1])
         # An offset at which the gyro misses most frames cannot be evaluated.
         if inside.sum() < max(10, 0.5 * len(rates)):
             return None
         begin, end = begins[inside] + offset, ends[inside] + offset
-        measured = np.stack([
-            (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
-            / (end - begin) for of_axis in turned.T], axis=1)
-        return min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
-                             offset, float(factor), R_prior) for factor in np.atleast_1d(factors)),
-                   key=lambda start: start.misfit)
+        measured = np.stack(
+            [
+                (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
+                / (end - begin)
+                for of_axis in turned.T
+            ],
+            axis=1,
+        )
+        return min(
+            (
+                _aligned(
+                    rates[inside] * [1.0 / factor, 1.0 / factor, 1.0],
+                    measured,
+                    offset,
+                    float(factor),
+                    R_prior,
+                )
+                for factor in np.atleast_1d(factors)
+            ),
+            key=lambda start: start.misfit,
+        )
 
     # The best offsets hardly depend on the focal length.
     offsets = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
-    starts = [start for offset in offsets
-              if (start := aligned(float(offset), np.median(focal_factors)))]
+    starts = [
+        start for offset in offsets if (start := aligned(float(offset), np.median(focal_factors)))
+    ]
     chosen: list[Start] = []
     for start in sorted(starts, key=lambda start: start.misfit):
         if all(abs(start.offset - other.offset) >= 4.0 * _STEP for other in chosen):
             chosen.append(start)
-    return sorted(filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
-                  key=lambda start: start.misfit)
+    return sorted(
+        filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
+        key=lambda start: start.misfit,
+    )
 
 
-def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: float,
-             R_prior: Array | None) -> Start:
+def _aligned(
+    estimated: Array, measured: Array, offset: float, focal_factor: float, R_prior: Array | None
+) -> Start:
     """Start with the rotation between two series of rates (P, 3) without their outliers."""
     kept = np.ones(len(estimated), dtype=bool)
     start = Start(offset, np.eye(3), focal_factor, 1.0)
@@ -460,14 +542,14 @@ def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: flo
         a, b = (rates - rates[kept].mean(axis=0) for rates in (estimated, measured))
         C = a[kept].T @ b[kept]
         u, s, vt = np.linalg.svd(C)
-        if s[1] < _ONE_AXIS * s[0]:   # the rotation nearest to a known one
+        if s[1] < _ONE_AXIS * s[0]:  # the rotation nearest to a known one
             nearest = nearest_axis_map(C) if R_prior is None else R_prior
             tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
             R = np.asarray(tilt.as_matrix() @ nearest)
         else:
             R = so3.aligning_rotation(C)
-        squares = ((a - b @ R.T)**2).sum(axis=1)
-        both = float((a[kept]**2).sum()) + float((b[kept]**2).sum())
+        squares = ((a - b @ R.T) ** 2).sum(axis=1)
+        both = float((a[kept] ** 2).sum()) + float((b[kept] ** 2).sum())
         start = start._replace(R_cam_imu=R, misfit=float(squares[kept].sum()) / max(both, 1e-12))
         kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
     return start

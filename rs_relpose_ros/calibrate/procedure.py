@@ -47,11 +47,17 @@ _ANY_ANGLE = math.pi / math.sqrt(3.0)
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
-def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
-              focal_known: bool = True, config: CalibrationConfig | None = None,
-              quat_prior: Sequence[float] | None = None,
-              rng: np.random.Generator | int = 0,
-              progress: Callable[[float], object] = lambda share: None) -> CalibrationResult:
+def calibrate(
+    tracks: Tracks,
+    gyro: GyroSeries,
+    camera: RollingShutterCamera,
+    *,
+    focal_known: bool = True,
+    config: CalibrationConfig | None = None,
+    quat_prior: Sequence[float] | None = None,
+    rng: np.random.Generator | int = 0,
+    progress: Callable[[float], object] = lambda share: None,
+) -> CalibrationResult:
     """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
 
     See `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md. The clock of `gyro` differs
@@ -66,8 +72,10 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     R_prior = None if quat_prior is None else Rotation.from_quat(quat_prior).as_matrix()
     rng = np.random.default_rng(rng)
     if len(tracks) < 2 or len(gyro) < 2:
-        raise InputError(f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
-                         'at least 10 s with both')
+        raise InputError(
+            f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
+            'at least 10 s with both'
+        )
     data = Observations.of(tracks, gyro, camera, config)
     _check_recording(data, config)
     progress(0.15)
@@ -94,8 +102,12 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     final = fit.widened(final, errors)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
-    curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
-                           lambda share: progress(0.8 + 0.2 * share))
+    curve = fit.cost_curve(
+        fit.with_bends(some, final.unknowns),
+        final,
+        data.interval,
+        lambda share: progress(0.8 + 0.2 * share),
+    )
     final, axes_known = _with_axes(data, final, R_prior)
     return evaluated(data, final, curve, config, axes_known=axes_known)
 
@@ -104,11 +116,16 @@ def warm_up_fit() -> None:
     """Compile (or load from the cache) the kernels of a calibration, on made-up points."""
     frames, points, rng = 60, 30, np.random.default_rng(0)
     stamps_ns = np.arange(frames) * to_nanoseconds(1.0 / 30.0)
-    tracks = Tracks(stamps_ns, np.repeat(np.arange(frames), points),
-                    np.tile(np.arange(points), frames), rng.uniform(0, 200, (frames * points, 2)))
+    tracks = Tracks(
+        stamps_ns,
+        np.repeat(np.arange(frames), points),
+        np.tile(np.arange(points), frames),
+        rng.uniform(0, 200, (frames * points, 2)),
+    )
     gyro_ns = np.arange(-100, 500) * to_nanoseconds(5e-3)
-    camera = RollingShutterCamera(width=200, height=200, fx=150.0, fy=150.0, cx=100.0, cy=100.0,
-                                  readout_time=0.0)
+    camera = RollingShutterCamera(
+        width=200, height=200, fx=150.0, fy=150.0, cx=100.0, cy=100.0, readout_time=0.0
+    )
     data = Observations.of(tracks, GyroSeries(gyro_ns, rng.normal(size=(600, 3))), camera)
     data.image_rates(data.pairs(_NEIGHBOURS, rng))
     problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
@@ -116,23 +133,24 @@ def warm_up_fit() -> None:
     fit.fit(fit.with_bends(problem, begin), begin, np.ones(model.GLOBAL, dtype=bool), rounds=1)
 
 
-def _with_axes(data: Observations, final: fit.Fit,
-               R_prior: Array | None) -> tuple[fit.Fit, bool]:
+def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tuple[fit.Fit, bool]:
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
     R, part = final.unknowns.R_imu_cam, slice(model.ROTATION, model.BIAS)
     covariance = final.covariance.copy()
-    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS:model.FOCAL], R.T)
-    if one_axis:   # about which the fit means nothing
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS : model.FOCAL], R.T)
+    if one_axis:  # about which the fit means nothing
         axis = R @ axis
         covariance[part] -= np.outer(axis, axis @ covariance[part])
         covariance[:, part] -= np.outer(covariance[:, part] @ axis, axis)
         covariance[part, part] += _ANY_ANGLE**2 * np.outer(axis, axis)
     turn = log_so3(np.ascontiguousarray((R @ R_prior).T))
     # As `angle_between`, axis by axis.
-    if turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part],
-                              turn) > 1.0:
+    if (
+        turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part], turn)
+        > 1.0
+    ):
         return final, False
     unknowns, covariance = joined(final.unknowns, covariance, part, turn, AXES_SIGMA**2)
     return replace(final, unknowns=unknowns, covariance=covariance), True
@@ -145,49 +163,66 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
         raise InputError(
             f'the recording is too short: {frames} frames in {data.times[-1]:.1f} s, at least '
             f'{_LEAST_FRAMES} are needed. Record 10 s or more while you rotate the camera '
-            'about all three axes')
+            'about all three axes'
+        )
     first = max(data.times[0], data.gyro_times[0] - config.max_time_offset)
     last = min(data.times[-1], data.gyro_times[-1] + config.max_time_offset)
     if last - first < 0.5 * data.times[-1]:
         raise InputError(
             f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of '
             'images: record both together, and let the clocks differ by less than '
-            f'{config.max_time_offset:g} s')
+            f'{config.max_time_offset:g} s'
+        )
     step = float(np.median(np.diff(data.gyro_times)))
     if step > observations.MAX_GYRO_GAP:
         raise InputError(
             f'the gyro has {1.0 / step:.0f} samples per second, at least '
-            f'{1.0 / observations.MAX_GYRO_GAP:.0f} are needed, 200 are good')
+            f'{1.0 / observations.MAX_GYRO_GAP:.0f} are needed, 200 are good'
+        )
     count = np.median(np.bincount(data.tracks.frames, minlength=frames))
     if count < _LEAST_MATCHES:
         raise InputError(
             f'there are too few points to follow: {count:.0f} per image in the '
             f'median, at least {_LEAST_MATCHES} are needed. Record a scene with texture, in good '
-            'light and focus')
+            'light and focus'
+        )
     spread = data.gyro_rates - np.median(data.gyro_rates, axis=0)
     rate = float(np.sqrt((spread**2).sum(axis=1).mean()))
     if rate < observations.LEAST_ROTATION:
         raise InputError(
             f'the camera hardly rotates: {np.degrees(rate):.2f} deg/s rms by the gyro, at least '
             f'{np.degrees(observations.LEAST_ROTATION):.1f} are needed. Rotate it to and fro '
-            'about all three axes, 20 to 60 deg/s')
+            'about all three axes, 20 to 60 deg/s'
+        )
 
 
-def _coarse_fit(about: Callable[[Array], Observations], data: Observations,
-                free: NDArray[np.bool_], R_prior: Array | None, config: CalibrationConfig,
-                rng: np.random.Generator) -> tuple[Observations, model.Unknowns]:
+def _coarse_fit(
+    about: Callable[[Array], Observations],
+    data: Observations,
+    free: NDArray[np.bool_],
+    R_prior: Array | None,
+    config: CalibrationConfig,
+    rng: np.random.Generator,
+) -> tuple[Observations, model.Unknowns]:
     """The best of the fits to a few pairs from each of the starts, and its data."""
     pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
             f'points can be followed over {len(pairs)} of {len(data.tracks) - 1} steps between '
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
-            'Record with a short exposure in good light, and rotate more slowly')
+            'Record with a short exposure in good light, and rotate more slowly'
+        )
     begins, ends = data.times[observations.frames_of(pairs)]
     starts = observations.find_starts(
-        data.image_rates(pairs), begins, ends, data.gyro_times, data.gyro_rates,
-        max_offset=config.max_time_offset + 0.02, R_prior=R_prior,
-        focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1))
+        data.image_rates(pairs),
+        begins,
+        ends,
+        data.gyro_times,
+        data.gyro_rates,
+        max_offset=config.max_time_offset + 0.02,
+        R_prior=R_prior,
+        focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1),
+    )
     if not starts:
         raise InputError('the gyro does not cover the images: record both together')
     fits = []
@@ -200,9 +235,14 @@ def _coarse_fit(about: Callable[[Array], Observations], data: Observations,
     return min(fits, key=lambda found: float(np.median(found[1].noise)))
 
 
-def _fit_with_lens(about: Callable[[Array], Observations], data: Observations,
-                   coarse: model.Unknowns, free: NDArray[np.bool_], selection: PairSelection,
-                   rng: np.random.Generator) -> tuple[Observations, fit.Fit]:
+def _fit_with_lens(
+    about: Callable[[Array], Observations],
+    data: Observations,
+    coarse: model.Unknowns,
+    free: NDArray[np.bool_],
+    selection: PairSelection,
+    rng: np.random.Generator,
+) -> tuple[Observations, fit.Fit]:
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
     seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
     for _ in range(_LENS_ROUNDS):
@@ -225,19 +265,24 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations,
 
 # -- Result of a fit, and observability --------------------------------------------------------
 
-_RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
-                'textured scene while rotating 20 to 60 deg/s about all three axes')
+_RECORD_MORE = (
+    'too little rotation, too short, or too few points: record 10 s or more of a '
+    'textured scene while rotating 20 to 60 deg/s about all three axes'
+)
 # A note if the intervals between frames vary for an unknown reason.
-_UNCLEAR = {observations.Varying.UNCLEAR: (
-    'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
-    'offset is assumed to be the same in all frames')}
+_UNCLEAR = {
+    observations.Varying.UNCLEAR: (
+        'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
+        'offset is assumed to be the same in all frames'
+    )
+}
 # Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
 _USELESS = 10.0
 # Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
 # focal length (relative).
 _MOST = np.zeros(model.GLOBAL)
 _MOST[[model.READOUT, model.OFFSET, model.SLOPE, model.FOCAL]] = 1.5e-3, 3e-3, 0.5, 0.03
-_MOST[model.BIAS:model.FOCAL] = 0.01
+_MOST[model.BIAS : model.FOCAL] = 0.01
 # Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
 # tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
 # exposure also changes within one step of the interval; of the focal length (relative), as the
@@ -245,29 +290,40 @@ _MOST[model.BIAS:model.FOCAL] = 0.01
 _COMMON = np.zeros((2, model.GLOBAL))
 _COMMON[:, model.FOCAL] = 2e-4
 _COMMON[1, [model.READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
-_COMMON[1, model.ROTATION:model.BIAS], _COMMON[1, model.BIAS:model.FOCAL] = 1e-3, 2.5e-4
+_COMMON[1, model.ROTATION : model.BIAS], _COMMON[1, model.BIAS : model.FOCAL] = 1e-3, 2.5e-4
 
 
-def evaluated(data: Observations, final: fit.Fit, curve: Array,
-              config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
+def evaluated(
+    data: Observations,
+    final: fit.Fit,
+    curve: Array,
+    config: CalibrationConfig,
+    *,
+    axes_known: bool = False,
+) -> CalibrationResult:
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
     common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
     unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
     if final.free[model.FOCAL]:
         # Widened, the sigmas of the lens may exceed those of its priors.
         known = slice(model.RADIAL, model.EXPOSURE)
-        unknowns, covariance = joined(unknowns, covariance, known, final.problem.center[known],
-                                       1.0 / final.problem.prior[known])
+        unknowns, covariance = joined(
+            unknowns,
+            covariance,
+            known,
+            final.problem.center[known],
+            1.0 / final.problem.prior[known],
+        )
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.FOCAL], R_cam_imu)
+    rates, one_axis, _ = data.excitation(parameters[model.BIAS : model.FOCAL], R_cam_imu)
     sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
     if fit.move_of_poses(final, covariance) <= 1.0:
         wide = max(wide, config.unnoticed_tolerance)
     # Row 0 is read this share of the readout before the middle row.
     to_first, height = np.zeros(model.GLOBAL), data.camera.height
     to_first[[model.OFFSET, model.READOUT]] = 1.0, -0.5 * (height - 1) / height
-    part = slice(model.ROTATION, model.BIAS)   # about the axes of the camera
+    part = slice(model.ROTATION, model.BIAS)  # about the axes of the camera
     rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
     axis_map = observations.nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
@@ -282,8 +338,13 @@ def evaluated(data: Observations, final: fit.Fit, curve: Array,
         factor = math.exp(data.lens[0] + parameters[model.FOCAL])
         lens = LensEstimates(
             _estimate(factor, factor * focal, factor * wide * _MOST[model.FOCAL], one_axis),
-            *(Estimate(value, float(sigma), True) for value, sigma in zip(
-                (camera.distortion[0], camera.cx, camera.cy), others, strict=True)))
+            *(
+                Estimate(value, float(sigma), True)
+                for value, sigma in zip(
+                    (camera.distortion[0], camera.cx, camera.cy), others, strict=True
+                )
+            ),
+        )
     if final.free[model.SLOPE]:
         slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
     jitters = data.stamps.varying is observations.Varying.JITTER
@@ -291,23 +352,39 @@ def evaluated(data: Observations, final: fit.Fit, curve: Array,
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         fitted_readout=float(unknowns.parameters[model.READOUT]),
-        time_offset=_estimate(float(to_first @ parameters), math.sqrt(
-            to_first @ covariance @ to_first), wide * _MOST[model.OFFSET]),
-        R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
-        rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
-                           wide * config.max_rotation_sigma, '' if axes_known else one_axis),
-        axis_map=axis_map, gyro_bias=tuple(map(of, range(model.BIAS, model.FOCAL))), lens=lens,
+        time_offset=_estimate(
+            float(to_first @ parameters),
+            math.sqrt(to_first @ covariance @ to_first),
+            wide * _MOST[model.OFFSET],
+        ),
+        R_cam_imu=R_cam_imu,
+        rotation_sigma=rotation_sigma,
+        rotation=_estimate(
+            math.acos(np.clip(cosine, -1.0, 1.0)),
+            rotation_sigma.max(),
+            wide * config.max_rotation_sigma,
+            '' if axes_known else one_axis,
+        ),
+        axis_map=axis_map,
+        gyro_bias=tuple(map(of, range(model.BIAS, model.FOCAL))),
+        lens=lens,
         exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,
         offset_by_interval=None if jitters else slope,
         offset_by_jitter=slope if jitters else None,
         stamp_jitter=jitters * float(np.sqrt((data.stamps.covariates**2).mean())),
-        rotation_rates=rates, curve=curve,
+        rotation_rates=rates,
+        curve=curve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
         inlier_ratio=float((final.weights > 0.25).mean()),
-        frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
-        frame_interval=data.interval, warnings=tuple(filter(None, (
-            unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying)))))
+        frames=len(data.tracks),
+        pairs=final.problem.pairs,
+        matches=int(final.problem.begin[-1]),
+        frame_interval=data.interval,
+        warnings=tuple(
+            filter(None, (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying)))
+        ),
+    )
 
 
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:
@@ -320,8 +397,13 @@ def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estima
     return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
-def joined(unknowns: model.Unknowns, covariance: Array, known: slice, values: Array | float,
-           variances: Array | float) -> tuple[model.Unknowns, Array]:
+def joined(
+    unknowns: model.Unknowns,
+    covariance: Array,
+    known: slice,
+    values: Array | float,
+    variances: Array | float,
+) -> tuple[model.Unknowns, Array]:
     """The calibration with independent values of some parameters, and its covariance."""
     own = covariance[known, known]
     gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
@@ -329,8 +411,9 @@ def joined(unknowns: model.Unknowns, covariance: Array, known: slice, values: Ar
     return fit.stepped(unknowns, step), covariance - gain @ covariance[known]
 
 
-def _bounded(unknowns: model.Unknowns, covariance: Array,
-             interval: float) -> tuple[model.Unknowns, Array, str]:
+def _bounded(
+    unknowns: model.Unknowns, covariance: Array, interval: float
+) -> tuple[model.Unknowns, Array, str]:
     """The calibration with its readout within an interval T between frames, and a note.
 
     The readout time is the mean of its normal distribution between these bounds, and the others
@@ -339,34 +422,50 @@ def _bounded(unknowns: model.Unknowns, covariance: Array,
     """
     k, known = model.READOUT, interval / math.sqrt(12.0)
     if covariance[k, k] > known**2:
-        return (*joined(unknowns, covariance, slice(k, k + 1), 0.5 * interval, known**2),
-                ('the images hardly determine the readout time: it is mostly that of any camera '
-                f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
+        return (
+            *joined(unknowns, covariance, slice(k, k + 1), 0.5 * interval, known**2),
+            (
+                'the images hardly determine the readout time: it is mostly that of any camera '
+                f'that is read downwards within the {1e3 * interval:.1f} ms between frames'
+            ),
+        )
     readout, sigma = float(unknowns.parameters[k]), math.sqrt(covariance[k, k])
     found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
-        abs(readout), sigma)
+        abs(readout), sigma
+    )
     if abs(readout) - 3.0 * sigma > interval:
         raise InputError(
             f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
             'no camera can do: check for frames that were dropped and stamped again, and for '
-            'images that were cropped, scaled or rotated')
+            'images that were cropped, scaled or rotated'
+        )
     # Of a truncated normal distribution; at least 0.1 % of it lies within.
     ends = (np.array([-interval, interval]) - readout) / sigma
     density, below = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi), special.ndtr(ends)
     mean = readout - sigma * float(np.diff(density)[0] / np.diff(below)[0])
     step = covariance[:, k] * ((mean - readout) / sigma**2)
-    note = '' if abs(readout) <= interval else (
-        f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters are '
-        f'for {1e3 * abs(mean):.1f} ms, the mean below that')
+    note = (
+        ''
+        if abs(readout) <= interval
+        else (
+            f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters '
+            f'are '
+            f'for {1e3 * abs(mean):.1f} ms, the mean below that'
+        )
+    )
     return fit.stepped(unknowns, step), covariance, note
 
 
 def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '') -> Estimate:
     """Estimate, observable if its sigma is within `limit` and nothing blocks it."""
     good = bool(sigma <= limit and not blocking_reason)
-    return Estimate(float(value), float(sigma), good,
-                    '' if good else blocking_reason or _RECORD_MORE,
-                    determined=sigma <= _USELESS * limit and not blocking_reason)
+    return Estimate(
+        float(value),
+        float(sigma),
+        good,
+        '' if good else blocking_reason or _RECORD_MORE,
+        determined=sigma <= _USELESS * limit and not blocking_reason,
+    )
 
 
 # -- Tracks and gyro of a bag -------------------------------------------------------------------
@@ -388,32 +487,49 @@ class CalibrationInput:
 
     tracks: Tracks
     gyro: GyroSeries
-    camera: RollingShutterCamera    # of the full sensor, its readout time 0
-    focal_known: bool               # by the CameraInfo; else `camera` is a guess
-    unused: dict[str, int]          # messages that were not used, by reason
-    is_whole: bool = True           # whether the images show the whole sensor, without binning
+    camera: RollingShutterCamera  # of the full sensor, its readout time 0
+    focal_known: bool  # by the CameraInfo; else `camera` is a guess
+    unused: dict[str, int]  # messages that were not used, by reason
+    is_whole: bool = True  # whether the images show the whole sensor, without binning
 
     def calibrated(self, config: CalibrationConfig, **options: Any) -> CalibrationResult:
         """Its calibration; `options` of `calibrate`."""
-        return calibrate(self.tracks, self.gyro, self.camera, focal_known=self.focal_known,
-                         config=config, **options)
+        return calibrate(
+            self.tracks,
+            self.gyro,
+            self.camera,
+            focal_known=self.focal_known,
+            config=config,
+            **options,
+        )
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
         """The same for a lens that is to be estimated; InputError if it has a distortion."""
         if any(self.camera.distortion):
-            raise InputError('the CameraInfo has distortion coefficients, beyond the first of '
-                             'which nothing is estimated: calibrate without --lens')
+            raise InputError(
+                'the CameraInfo has distortion coefficients, beyond the first of '
+                'which nothing is estimated: calibrate without --lens'
+            )
         if not self.is_whole:
-            raise InputError('the CameraInfo has a region of interest or binning, which '
-                             'camera_matrix cannot describe: calibrate without --lens')
+            raise InputError(
+                'the CameraInfo has a region of interest or binning, which '
+                'camera_matrix cannot describe: calibrate without --lens'
+            )
         counts = DISTORTION_MODELS[distortion_model].coefficient_counts
-        return replace(self, focal_known=False, camera=replace(
-            self.camera, distortion_model=distortion_model,
-            distortion=(0.0,) * max(counts[0], 5 if len(counts) > 2 else 4)))
+        return replace(
+            self,
+            focal_known=False,
+            camera=replace(
+                self.camera,
+                distortion_model=distortion_model,
+                distortion=(0.0,) * max(counts[0], 5 if len(counts) > 2 else 4),
+            ),
+        )
 
 
-def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig, *,
-                   images: range | None = None) -> CalibrationInput:
+def read_recording(
+    bag: Bag, topics: SensorTopics, tracking: TrackingConfig, *, images: range | None = None
+) -> CalibrationInput:
     """Follow points through the images of an open bag, and collect its gyro.
 
     Of `images`, by their number in the bag, and of the gyro meanwhile; None: all. InputError or
@@ -436,14 +552,14 @@ class Recorder:
 
     def __init__(self, tracking: TrackingConfig, longest: float = math.inf) -> None:
         self.intrinsics: Intrinsics | None = None
-        self.uncalibrated = False   # whether there is no calibrated CameraInfo
-        self.unused = ReasonCounts()   # messages
+        self.uncalibrated = False  # whether there is no calibrated CameraInfo
+        self.unused = ReasonCounts()  # messages
         self._longest = longest
         self._tracker, self._levels = make_tracker(tracking), GrayLevels()
-        self._since_renewed = 0     # images
+        self._since_renewed = 0  # images
         # Stamps of the images, ids and pixels (N, 2) of their points.
         self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
-        self.size = (0, 0)   # of the images [px]
+        self.size = (0, 0)  # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
 
     @property
@@ -491,8 +607,9 @@ class Recorder:
         if tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER:
             tracker.promote()
             self._since_renewed = 0
-        self._frames.append((encoded.stamp_ns, matches.track_ids,
-                             matches.points2.astype(np.float32)))   # to 1e-4 px
+        self._frames.append(
+            (encoded.stamp_ns, matches.track_ids, matches.points2.astype(np.float32))
+        )  # to 1e-4 px
         self.size = image.shape[1], image.shape[0]
         while self.seconds > self._longest:
             self._frames.popleft()
@@ -503,12 +620,13 @@ class Recorder:
     def set_back(self, stamp_ns: int) -> None:
         """Move all that is recorded to end a second before `stamp_ns`, on a clock set back."""
         earlier_ns = self.last_ns - stamp_ns + _MARGIN_NS
-        self._frames = deque((stamp - earlier_ns, ids, points)
-                             for stamp, ids, points in self._frames)
+        self._frames = deque(
+            (stamp - earlier_ns, ids, points) for stamp, ids, points in self._frames
+        )
         moved: dict[int, tuple[float, float, float]] = {}
         last_ns = next(iter(self._gyro), 0)
         for stamp, rates in self._gyro.items():
-            if stamp < last_ns - _MARGIN_NS:   # since then
+            if stamp < last_ns - _MARGIN_NS:  # since then
                 break
             last_ns = stamp
             moved[stamp - earlier_ns] = rates
@@ -521,8 +639,10 @@ class Recorder:
         if not self._frames:
             raise InputError(f'no image can be used{why}')
         if not self._gyro:
-            raise MissingInputError(f'no message of the IMU has a gyro{why}: record the angular '
-                                    'velocity together with the images')
+            raise MissingInputError(
+                f'no message of the IMU has a gyro{why}: record the angular '
+                'velocity together with the images'
+            )
         intrinsics = self.intrinsics
         if intrinsics is None and not self.uncalibrated:
             raise MissingInputError(f'no CameraInfo can be used{why}')
@@ -537,14 +657,27 @@ class Recorder:
         if intrinsics is None:
             guess = _FOCAL_GUESS * max(width, height)
             camera = RollingShutterCamera(
-                width=width, height=height, fx=guess, fy=guess, cx=0.5 * (width - 1),
-                cy=0.5 * (height - 1), readout_time=0.0)
+                width=width,
+                height=height,
+                fx=guess,
+                fy=guess,
+                cx=0.5 * (width - 1),
+                cy=0.5 * (height - 1),
+                readout_time=0.0,
+            )
         elif (width, height) == (intrinsics.image_width, intrinsics.image_height):
             camera = intrinsics.global_shutter_camera()
         else:
             raise InputError(
                 f'the images are {width}x{height}, but the CameraInfo is for '
                 f'{intrinsics.image_width}x{intrinsics.image_height}: a resized image needs a '
-                'CameraInfo of its own')
-        return CalibrationInput(tracks, gyro, camera, intrinsics is not None, unused,
-                                self.size == (camera.width, camera.height))
+                'CameraInfo of its own'
+            )
+        return CalibrationInput(
+            tracks,
+            gyro,
+            camera,
+            intrinsics is not None,
+            unused,
+            self.size == (camera.width, camera.height),
+        )

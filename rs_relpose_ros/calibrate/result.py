@@ -28,15 +28,15 @@ class Estimate:
     sigma: float
     observable: bool
     remark: str = ''
-    determined: bool = True     # whether the value means anything
+    determined: bool = True  # whether the value means anything
 
 
 class LensEstimates(NamedTuple):
     """A lens that was not known."""
 
-    focal_factor: Estimate   # true over assumed focal length
-    radial: Estimate   # first coefficient of the distortion
-    column: Estimate   # principal point [px]
+    focal_factor: Estimate  # true over assumed focal length
+    radial: Estimate  # first coefficient of the distortion
+    column: Estimate  # principal point [px]
     row: Estimate
 
 
@@ -48,34 +48,34 @@ class CalibrationResult:
     read upwards, with `time_offset` still that of row 0.
     """
 
-    readout_time: Estimate                  # signed [s]
-    fitted_readout: float                   # without its bound, the frame interval [s]
-    time_offset: Estimate                   # of row 0 [s], at the median interval between frames
-    R_cam_imu: Array                        # (3, 3) v_cam = R_cam_imu v_imu
-    rotation_sigma: Array                   # (3,) 1 sigma about the camera's axes [rad]
-    rotation: Estimate                      # angle to `axis_map` [rad], with the largest sigma
-    axis_map: Array                         # (3, 3) the nearest rotation between axes
-    gyro_bias: tuple[Estimate, ...]         # of the three axes of the IMU [rad/s]
-    lens: LensEstimates | None              # None if known
-    exposure: Estimate                      # at the median interval between frames [s]
-    exposure_margin: float                  # that interval less the exposure, if it follows it
+    readout_time: Estimate  # signed [s]
+    fitted_readout: float  # without its bound, the frame interval [s]
+    time_offset: Estimate  # of row 0 [s], at the median interval between frames
+    R_cam_imu: Array  # (3, 3) v_cam = R_cam_imu v_imu
+    rotation_sigma: Array  # (3,) 1 sigma about the camera's axes [rad]
+    rotation: Estimate  # angle to `axis_map` [rad], with the largest sigma
+    axis_map: Array  # (3, 3) the nearest rotation between axes
+    gyro_bias: tuple[Estimate, ...]  # of the three axes of the IMU [rad/s]
+    lens: LensEstimates | None  # None if known
+    exposure: Estimate  # at the median interval between frames [s]
+    exposure_margin: float  # that interval less the exposure, if it follows it
     # Change of the offset by the interval between frames [s/s], as by automatic exposure; None if
     # the intervals do not vary like that.
     offset_by_interval: Estimate | None
     # Change of the offset by how early a stamp is against a smooth line [s/s], 1 if only the
     # stamps jitter; None if they do not.
     offset_by_jitter: Estimate | None
-    stamp_jitter: float                     # rms about the smooth line [s]
-    rotation_rates: Array                   # (3,) rms about the camera's axes less mean [rad/s]
+    stamp_jitter: float  # rms about the smooth line [s]
+    rotation_rates: Array  # (3,) rms about the camera's axes less mean [rad/s]
     # (2, K) signed readout times [s], and the log-likelihood lost against the best with all other
     # parameters fitted again, scaled to independent pairs.
     curve: Array
-    pixel_sigma: float                      # of a match [px]
+    pixel_sigma: float  # of a match [px]
     inlier_ratio: float
     frames: int
     pairs: int
     matches: int
-    frame_interval: float                   # median [s]
+    frame_interval: float  # median [s]
     warnings: tuple[str, ...] = ()
 
     @property
@@ -125,64 +125,102 @@ _BIAS_CHANGE = 1e-3
 _MS = 1e3
 
 
-def quantities(result: CalibrationResult,
-               camera: RollingShutterCamera) -> list[tuple[str, str, Estimate]]:
+def quantities(
+    result: CalibrationResult, camera: RollingShutterCamera
+) -> list[tuple[str, str, Estimate]]:
     """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
     readout, exposure = result.readout_time, result.exposure
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
-             + (', read upwards' if readout.value < 0.0 else ''), readout),
-            ('time offset (row 0)', _shown('time_offset', result.time_offset),
-             result.time_offset)]
+    rows = [
+        (
+            'readout time',
+            _shown('readout_time', readout, abs(readout.value))
+            + (', read upwards' if readout.value < 0.0 else ''),
+            readout,
+        ),
+        ('time offset (row 0)', _shown('time_offset', result.time_offset), result.time_offset),
+    ]
     if slope is not None:
-        text = (f'{_rounded(slope, 3)} ms per ms of the interval to the previous frame, '
-                f'{_MS * result.frame_interval:.2f} ms in the median (automatic exposure)')
+        text = (
+            f'{_rounded(slope, 3)} ms per ms of the interval to the previous frame, '
+            f'{_MS * result.frame_interval:.2f} ms in the median (automatic exposure)'
+        )
         rows.append(('offset by interval', text, slope))
     if jitter is not None:
-        text = (f'{_MS * result.stamp_jitter:.2f} ms rms about a smooth line, which the images '
-                f'follow by {_rounded(jitter, 2)} (1: the stamps alone jitter); not automatic '
-                'exposure')
+        text = (
+            f'{_MS * result.stamp_jitter:.2f} ms rms about a smooth line, which the images '
+            f'follow by {_rounded(jitter, 2)} (1: the stamps alone jitter); not automatic '
+            'exposure'
+        )
         rows.append(('jitter of stamps', text, jitter))
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
-    text = (f'{axes_text(result.axis_map)}, and {np.degrees(result.rotation.value):.2f} deg off '
-            f"it; 1 sigma about the camera's x, y, z: {sigmas} deg")
-    rows += [('rotation IMU to camera', text, result.rotation),
-             *((f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
-               for axis, bias in zip('xyz', result.gyro_bias, strict=True))]
+    text = (
+        f'{axes_text(result.axis_map)}, and {np.degrees(result.rotation.value):.2f} deg off '
+        f"it; 1 sigma about the camera's x, y, z: {sigmas} deg"
+    )
+    rows += [
+        ('rotation IMU to camera', text, result.rotation),
+        *(
+            (f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
+            for axis, bias in zip('xyz', result.gyro_bias, strict=True)
+        ),
+    ]
     if exposure.sigma:
-        text = (f'{_rounded(exposure, 1, _MS)} ms at the median interval, over which the gyro is '
-                'averaged')
+        text = (
+            f'{_rounded(exposure, 1, _MS)} ms at the median interval, over which the gyro is '
+            'averaged'
+        )
         if result.exposure_margin:
-            text += (f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
-                     'automatic exposure lengthens it)')
+            text += (
+                f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
+                'automatic exposure lengthens it)'
+            )
         rows.append(('exposure', text, exposure))
     if result.lens is not None:
         focal, radial, column, row = result.lens
         text = f'{_rounded(radial, 3)} (first coefficient of {camera.distortion_model})'
         rows += [
-            ('focal length', BY_NAME['focal_length'].with_sigma(
-                camera.fx * focal.value, camera.fx * focal.sigma), focal),
+            (
+                'focal length',
+                BY_NAME['focal_length'].with_sigma(
+                    camera.fx * focal.value, camera.fx * focal.sigma
+                ),
+                focal,
+            ),
             ('distortion', text, radial),
-            ('principal point', f'{_rounded(column, 1)}, {_rounded(row, 1)} px', column)]
+            ('principal point', f'{_rounded(column, 1)}, {_rounded(row, 1)} px', column),
+        ]
     return rows
 
 
 def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
     """Lines for a reader: each quantity with its 1 sigma and its observability."""
-    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
-                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
-    text = (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
-            f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
-            f'{result.pixel_sigma:.2f} px')
-    lines = [text, f'rotation of the camera, rms [deg/s]: {rates}',
-             f'shutter: {_shutter_text(result)}']
+    rates = ', '.join(
+        f'{axis} {np.degrees(rate):.1f}'
+        for axis, rate in zip(AXES, result.rotation_rates, strict=True)
+    )
+    text = (
+        f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
+        f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
+        f'{result.pixel_sigma:.2f} px'
+    )
+    lines = [
+        text,
+        f'rotation of the camera, rms [deg/s]: {rates}',
+        f'shutter: {_shutter_text(result)}',
+    ]
     for name, text, of in quantities(result, camera):
-        state = 'observable' if of.observable else (
-            'weak: ' if of.determined else 'NOT OBSERVABLE: ') + of.remark
+        state = (
+            'observable'
+            if of.observable
+            else ('weak: ' if of.determined else 'NOT OBSERVABLE: ') + of.remark
+        )
         lines.append(f'{name}: {text} [{state}]')
-    return [*lines,
-            'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
-            *(f'note: {warning}' for warning in result.warnings)]
+    return [
+        *lines,
+        'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
+        *(f'note: {warning}' for warning in result.warnings),
+    ]
 
 
 def _rounded(estimate: Estimate, digits: int, factor: float = 1.0) -> str:
@@ -202,29 +240,40 @@ def _shutter_text(result: CalibrationResult) -> str:
     if result.shutter == 'unsure':
         return f'unsure: {shown}; record longer, and rotate the camera faster'
     sigmas = abs(readout.value) / max(readout.sigma, 1e-9)
-    return (f'rolling: the readout time is {sigmas:.0f} sigma from 0, and the log-likelihood '
-            f'of a global shutter is lower by {np.interp(0.0, *result.curve):.0f}')
+    return (
+        f'rolling: the readout time is {sigmas:.0f} sigma from 0, and the log-likelihood '
+        f'of a global shutter is lower by {np.interp(0.0, *result.curve):.0f}'
+    )
 
 
 # Parameter of the node: name, value and source.
 _Parameter = tuple[str, float | str | tuple[float, ...], str]
 
 
-def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
-                   compressed: bool | None = None,
-                   feature_rows: tuple[float, ...] = (0.0, 0.0),
-                   placed: Mapping[str, Any] | None = None) -> str:
+def parameter_file(
+    result: CalibrationResult,
+    title: str,
+    *,
+    camera: RollingShutterCamera,
+    compressed: bool | None = None,
+    feature_rows: tuple[float, ...] = (0.0, 0.0),
+    placed: Mapping[str, Any] | None = None,
+) -> str:
     """The node's parameter file: each value with its sigma; undetermined ones are named only.
 
     `camera` is that of the calibration: a guess if the lens was not known. `compressed`: the
     images of a bag. `placed`: parameters of a transform.
     """
-    values: list[_Parameter] = [] if compressed is None else [(
-        'image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
+    values: list[_Parameter] = (
+        []
+        if compressed is None
+        else [('image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
+    )
     groups = [*_parameters(result)]
     if result.lens is not None:
-        groups.append((result.lens.focal_factor, 'camera_matrix',
-                       _lens_parameters(result.lens, camera)))
+        groups.append(
+            (result.lens.focal_factor, 'camera_matrix', _lens_parameters(result.lens, camera))
+        )
     for part, _, group in groups:
         values += group if part.determined else []
     if feature_rows[1] > 0.0:
@@ -245,56 +294,110 @@ def _parameters(result: CalibrationResult) -> Iterator[tuple[Estimate, str, list
     readout, offset, exposure = result.readout_time, result.time_offset, result.exposure
     slope, biases, shutter = result.offset_by_interval, result.gyro_bias, _shutter_text(result)
     rolling = result.shutter != 'global'
-    source = (f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
-              f'sigma); at most the {_MS * result.frame_interval:.1f} ms between frames.')
-    yield readout, 'readout_time', [
-        ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
-        _sigma('readout_time', readout.sigma, 6),
-        ('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
-         'By the sign of that estimate.')]
+    source = (
+        f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
+        f'sigma); at most the {_MS * result.frame_interval:.1f} ms between frames.'
+    )
+    yield (
+        readout,
+        'readout_time',
+        [
+            ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
+            _sigma('readout_time', readout.sigma, 6),
+            (
+                'readout_direction',
+                'up' if rolling and readout.value < 0.0 else 'down',
+                'By the sign of that estimate.',
+            ),
+        ],
+    )
     clock: list[_Parameter] = [
         ('stamp_row', 'first', 'Convention of time_offset here.'),
         ('time_offset', round(offset.value, 6), 'To the middle of the exposure of row 0.'),
-        _sigma('time_offset', offset.sigma, 6)]
+        _sigma('time_offset', offset.sigma, 6),
+    ]
     if slope is not None:
-        clock += [('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
-                  _sigma('time_offset_per_interval', slope.sigma, 4),
-                  ('time_offset_reference_interval', round(result.frame_interval, 6),
-                   'Median interval between frames, to which time_offset refers.')]
+        clock += [
+            ('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
+            _sigma('time_offset_per_interval', slope.sigma, 4),
+            (
+                'time_offset_reference_interval',
+                round(result.frame_interval, 6),
+                'Median interval between frames, to which time_offset refers.',
+            ),
+        ]
     if result.exposure_margin:
         margin = max(result.frame_interval - exposure.value, 1e-3)
-        source = (f'Exposure {_rounded(exposure, 1, _MS)} ms at that interval, assumed as '
-                  f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.')
+        source = (
+            f'Exposure {_rounded(exposure, 1, _MS)} ms at that interval, assumed as '
+            f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.'
+        )
         clock.append(('exposure_margin', round(margin, 5), source))
     elif exposure.value > 2.0 * exposure.sigma:
-        clock.append(('exposure_time', round(exposure.value, 5),
-                      f'1 sigma {_MS * exposure.sigma:.1f} ms.'))
+        clock.append(
+            ('exposure_time', round(exposure.value, 5), f'1 sigma {_MS * exposure.sigma:.1f} ms.')
+        )
     yield offset, 'time_offset', clock
-    yield result.rotation, 'quat_cam_imu_xyzw', [
-        ('quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
-         f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off.'),
-        _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].')]
-    yield max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
-        ('gyro_bias', tuple(round(bias.value, 5) for bias in biases),
-         f'1 sigma {", ".join(f"{bias.sigma:.5f}" for bias in biases)} rad/s.'),
-        _sigma('gyro_bias', result.bias_sigma, 5,
-               f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')]
+    yield (
+        result.rotation,
+        'quat_cam_imu_xyzw',
+        [
+            (
+                'quat_cam_imu_xyzw',
+                tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+                f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off.',
+            ),
+            _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].'),
+        ],
+    )
+    yield (
+        max(biases, key=lambda bias: bias.sigma),
+        'gyro_bias',
+        [
+            (
+                'gyro_bias',
+                tuple(round(bias.value, 5) for bias in biases),
+                f'1 sigma {", ".join(f"{bias.sigma:.5f}" for bias in biases)} rad/s.',
+            ),
+            _sigma(
+                'gyro_bias',
+                result.bias_sigma,
+                5,
+                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.',
+            ),
+        ],
+    )
 
 
 def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[_Parameter]:
     focal, radial, column, row = lens
     others = (0.0,) * ((len(camera.distortion) or 4) - 1)
     return [
-        ('camera_matrix', (
-            round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,
-            round(camera.fy * focal.value, 2), round(row.value, 2), 0.0, 0.0, 1.0),
-         f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.'),
+        (
+            'camera_matrix',
+            (
+                round(camera.fx * focal.value, 2),
+                0.0,
+                round(column.value, 2),
+                0.0,
+                round(camera.fy * focal.value, 2),
+                round(row.value, 2),
+                0.0,
+                0.0,
+                1.0,
+            ),
+            f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.',
+        ),
         ('distortion_model', camera.distortion_model, ''),
-        ('distortion_coefficients', (round(radial.value, 5), *others),
-         'The first coefficient is estimated, the others are assumed to be zero.'),
+        (
+            'distortion_coefficients',
+            (round(radial.value, 5), *others),
+            'The first coefficient is estimated, the others are assumed to be zero.',
+        ),
         _sigma('focal_length', focal.sigma / focal.value, 5, 'Relative.'),
         _sigma('distortion', radial.sigma, 5),
-        _sigma('principal_point', max(column.sigma, row.sigma), 2, 'In pixels.')]
+        _sigma('principal_point', max(column.sigma, row.sigma), 2, 'In pixels.'),
+    ]
 
 
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
@@ -305,30 +408,40 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         focal, radial, *center = map(asdict, result.lens)
         focal |= {name: focal[name] * camera.fx for name in ('value', 'sigma')}
     return {
-        'observable': result.observable, 'shutter': result.shutter,
+        'observable': result.observable,
+        'shutter': result.shutter,
         'readout_time_s': asdict(result.readout_time),
         'time_offset_s': asdict(result.time_offset),
         'offset_by_interval': slope and asdict(slope),
-        'offset_by_jitter': jitter and asdict(jitter), 'stamp_jitter_s': result.stamp_jitter,
+        'offset_by_jitter': jitter and asdict(jitter),
+        'stamp_jitter_s': result.stamp_jitter,
         'quat_cam_imu_xyzw': list(result.quat_cam_imu_xyzw),
         'rotation_sigma_rad': result.rotation_sigma.tolist(),
         'rotation_from_axis_map_rad': asdict(result.rotation),
         'axis_map': result.axis_map.tolist(),
         'gyro_bias_rad_per_s': [asdict(bias) for bias in result.gyro_bias],
-        'focal_px': focal, 'distortion_first': radial, 'principal_point_px': center,
-        'exposure_s': asdict(result.exposure), 'exposure_margin_s': result.exposure_margin,
+        'focal_px': focal,
+        'distortion_first': radial,
+        'principal_point_px': center,
+        'exposure_s': asdict(result.exposure),
+        'exposure_margin_s': result.exposure_margin,
         'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),
-        'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,
-        'inlier_ratio': result.inlier_ratio, 'pixel_sigma': result.pixel_sigma,
-        'frame_interval_s': result.frame_interval, 'warnings': list(result.warnings),
-        'cost_over_readout': dict(zip(('readout_s', 'cost'), result.curve.tolist(),
-                                      strict=True))}
+        'frames': result.frames,
+        'pairs': result.pairs,
+        'matches': result.matches,
+        'inlier_ratio': result.inlier_ratio,
+        'pixel_sigma': result.pixel_sigma,
+        'frame_interval_s': result.frame_interval,
+        'warnings': list(result.warnings),
+        'cost_over_readout': dict(zip(('readout_s', 'cost'), result.curve.tolist(), strict=True)),
+    }
 
 
 def draw_curve(result: CalibrationResult, path: Path) -> None:
     """Draw the cost over the readout time."""
     # A node draws nothing, and starts sooner.
     from matplotlib.figure import Figure
+
     picture = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
     axes = picture.subplots()
     readout, (tried, costs) = result.readout_time, result.curve
@@ -336,9 +449,13 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     axes.plot(_MS * tried, np.sqrt(2.0 * costs), 'o-', color=BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)
     axes.axvline(_MS * readout.value, color=ORANGE, label=_shown('readout_time', readout))
-    axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
-                 _MS * (readout.value + 3 * readout.sigma), color=ORANGE, alpha=0.25,
-                 label='3 sigma')
+    axes.axvspan(
+        _MS * (readout.value - 3 * readout.sigma),
+        _MS * (readout.value + 3 * readout.sigma),
+        color=ORANGE,
+        alpha=0.25,
+        label='3 sigma',
+    )
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel('readout time [ms], negative: upwards; to +- one frame interval')
     axes.set_ylabel('cost: sqrt(2 x log-likelihood lost) [sigma]')

@@ -37,7 +37,7 @@ class Progress:
     """State of a calibration that goes on."""
 
     text: str
-    share: float = 0.0   # of the quantities that are known well enough
+    share: float = 0.0  # of the quantities that are known well enough
     # Name -> value with sigma, and what is missing.
     values: dict[str, str] = field(default_factory=dict)
 
@@ -49,7 +49,7 @@ class Calibrated:
     camera: CameraId
     parameters: str
     summary: str
-    new: bool = True   # whether it is not in its file yet
+    new: bool = True  # whether it is not in its file yet
 
 
 def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
@@ -61,9 +61,11 @@ def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
         return Path(config.calibration_file).expanduser()
     try:
         home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
-    except RuntimeError as error:   # HOME is not set, and the user has no entry
-        raise InputError('there is no home directory for the calibration: set HOME or ROS_HOME, '
-                         'or give calibration_file') from error
+    except RuntimeError as error:  # HOME is not set, and the user has no entry
+        raise InputError(
+            'there is no home directory for the calibration: set HOME or ROS_HOME, '
+            'or give calibration_file'
+        ) from error
     name = _ILLEGAL.sub('_', camera.name) or 'camera'
     return home / 'rs_relpose' / f'{name}_{camera.width}x{camera.height}.yaml'
 
@@ -77,20 +79,26 @@ def save(path: Path, camera: CameraId, parameters: str, *, replace: bool = True)
         try:
             load(path, camera)
         except InputError as error:
-            raise InputError(f'{error}. It is kept, and the new calibration is not stored: '
-                             '~/save_calibration would replace it') from error
+            raise InputError(
+                f'{error}. It is kept, and the new calibration is not stored: '
+                '~/save_calibration would replace it'
+            ) from error
     name = camera.name.replace("'", "''")
-    text = (f"{parameters}{_SECTION}:\n  ros__parameters:\n    camera_name: '{name}'\n"
-            f'    image_width: {camera.width}\n    image_height: {camera.height}\n'
-            f"    image_topic: '{camera.topic}'\n"
-            f"    date: '{datetime.now().astimezone().date().isoformat()}'\n")
+    text = (
+        f"{parameters}{_SECTION}:\n  ros__parameters:\n    camera_name: '{name}'\n"
+        f'    image_width: {camera.width}\n    image_height: {camera.height}\n'
+        f"    image_topic: '{camera.topic}'\n"
+        f"    date: '{datetime.now().astimezone().date().isoformat()}'\n"
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with written(path) as file:
             file.write(text)
     except OSError as error:
-        raise InputError(f'the calibration cannot be stored in {path}: {error.strerror}; give '
-                         'another calibration_file') from error
+        raise InputError(
+            f'the calibration cannot be stored in {path}: {error.strerror}; give '
+            'another calibration_file'
+        ) from error
 
 
 def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
@@ -100,7 +108,7 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     """
     try:
         own, values = file_values(path, _SECTION), file_values(path)
-        read_parameters(path)   # a name or value that was edited by hand may be illegal
+        read_parameters(path)  # a name or value that was edited by hand may be illegal
     except OSError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error
     if not {'camera_name', 'image_width', 'image_height', 'date'} <= own.keys():
@@ -108,14 +116,21 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     of = CameraId(own['camera_name'], own['image_width'], own['image_height'], camera.topic)
     topic = own.get('image_topic')
     if topic and camera.topic and camera.topic != topic:
-        raise InputError(f'{path} is of the images on {topic}, not on {camera.topic}, which have '
-                         'the same frame_id: give each camera_name, or that of this file')
+        raise InputError(
+            f'{path} is of the images on {topic}, not on {camera.topic}, which have '
+            'the same frame_id: give each camera_name, or that of this file'
+        )
     if of != camera:
-        raise InputError(f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
-                         f'for {camera.name!r} of {camera.width}x{camera.height}')
-    known = [f'{name.replace("_", " ")} '
-             + BY_NAME[name].with_sigma(values[name], values[f'{name}_sigma'])
-             for name in ('readout_time', 'time_offset') if f'{name}_sigma' in values]
+        raise InputError(
+            f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
+            f'for {camera.name!r} of {camera.width}x{camera.height}'
+        )
+    known = [
+        f'{name.replace("_", " ")} '
+        + BY_NAME[name].with_sigma(values[name], values[f'{name}_sigma'])
+        for name in ('readout_time', 'time_offset')
+        if f'{name}_sigma' in values
+    ]
     if 'axes_sigma' in values:
         known.append(f'axes +- {math.degrees(values["axes_sigma"]):.2f} deg')
     return values, f'{own["date"]} ({", ".join(known)})'

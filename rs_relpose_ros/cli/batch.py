@@ -44,13 +44,15 @@ from rs_relpose_ros.output_files import (
     written,
 )
 
-HELP = ('Run check, calibrate or replay over many bags: on processes of this machine, one thread '
-        'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
-        '(a row for each bag: state, metrics, errors, times), summary.json, overview.png and a '
-        'folder with the results of each bag, as of a single run. A bag with a result is not '
-        'processed again unless it, its parameters, the options or the version changed. For '
-        'calibrate, all bags must be of one camera: the summary has weighted means, chi2 and '
-        'outliers. Exit code 1: some bags were refused, failed, or are not as they should be.')
+HELP = (
+    'Run check, calibrate or replay over many bags: on processes of this machine, one thread '
+    'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
+    '(a row for each bag: state, metrics, errors, times), summary.json, overview.png and a '
+    'folder with the results of each bag, as of a single run. A bag with a result is not '
+    'processed again unless it, its parameters, the options or the version changed. For '
+    'calibrate, all bags must be of one camera: the summary has weighted means, chi2 and '
+    'outliers. Exit code 1: some bags were refused, failed, or are not as they should be.'
+)
 
 RESULTS_FILE = 'results.csv'
 PICTURE_FILE = 'overview.png'
@@ -58,8 +60,7 @@ _JOB_FILE = 'job.json'
 _BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 
 # How the work on a bag ended; findings: completed, and its exit code is 1; lost: its workers died.
-DONE, FINDINGS, REFUSED, FAILED, LOST = STATES = (
-    'done', 'findings', 'refused', 'failed', 'lost')
+DONE, FINDINGS, REFUSED, FAILED, LOST = STATES = ('done', 'findings', 'refused', 'failed', 'lost')
 # States that another run would not change.
 _LASTING = (DONE, FINDINGS, REFUSED)
 
@@ -67,13 +68,14 @@ _LASTING = (DONE, FINDINGS, REFUSED)
 _WORK: Mapping[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
     'check': lambda args: inspect_bag(args).to_mapping(),
     'calibrate': lambda args: as_mapping(*calibrate_bag(args)),
-    'replay': lambda args: replay_bag(args)[1].metrics}
+    'replay': lambda args: replay_bag(args)[1].metrics,
+}
 
 _MOST_LINES = 20
 # How many workers may die over one bag before it is given up, less one.
 _ALLOWED_DEATHS = 1
 _ABSENT = "many bags need Dask, which is not installed: pip install 'dask[distributed]'"
-_TIMEOUT = 20.0   # to find a scheduler and its workers [s]
+_TIMEOUT = 20.0  # to find a scheduler and its workers [s]
 
 # A row of the table by column: state, metrics of a completed command. Files of results by name.
 Row = dict[str, Any]
@@ -82,20 +84,38 @@ Files = dict[str, bytes]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('batch_command', metavar='COMMAND', choices=tuple(_WORK),
-                        help='check, calibrate or replay')
-    parser.add_argument('bags', metavar='BAGS', nargs='+',
-                        help='bags, or globs in quotes, as the workers see them')
-    parser.add_argument('--out', metavar='DIR', type=Path, required=True,
-                        help='directory of the results; those of an earlier run are reused')
-    parser.add_argument('--scheduler', metavar='ADDRESS',
-                        help='a running Dask cluster, such as tcp://host:8786; its workers need '
-                        'this package (the same version), and one thread each')
-    parser.add_argument('--workers', metavar='N', type=int,
-                        help='processes of this machine (default: one for each processor)')
+    parser.add_argument(
+        'batch_command', metavar='COMMAND', choices=tuple(_WORK), help='check, calibrate or replay'
+    )
+    parser.add_argument(
+        'bags', metavar='BAGS', nargs='+', help='bags, or globs in quotes, as the workers see them'
+    )
+    parser.add_argument(
+        '--out',
+        metavar='DIR',
+        type=Path,
+        required=True,
+        help='directory of the results; those of an earlier run are reused',
+    )
+    parser.add_argument(
+        '--scheduler',
+        metavar='ADDRESS',
+        help='a running Dask cluster, such as tcp://host:8786; its workers need '
+        'this package (the same version), and one thread each',
+    )
+    parser.add_argument(
+        '--workers',
+        metavar='N',
+        type=int,
+        help='processes of this machine (default: one for each processor)',
+    )
     declared(PARAMETERS)(parser)
-    parser.add_argument('--options', metavar='TEXT', default='',
-                        help='further options of COMMAND, in quotes: --options="--no-pictures"')
+    parser.add_argument(
+        '--options',
+        metavar='TEXT',
+        default='',
+        help='further options of COMMAND, in quotes: --options="--no-pictures"',
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -105,12 +125,16 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f'--workers must be at least 1, got {args.workers}')
     options, parameters = _options(args)
     refuse_unwritable(args.out)
-    with open_cluster(args.scheduler, args.workers) as client, \
-            progress_bar(0, 'bag', command) as bar:
+    with (
+        open_cluster(args.scheduler, args.workers) as client,
+        progress_bar(0, 'bag', command) as bar,
+    ):
         theirs = client.submit(package_version, pure=False).result()
         if theirs != version:
-            raise InputError(f'the workers have version {theirs} of this package, but here is '
-                             f'{version}: their results would not be comparable')
+            raise InputError(
+                f'the workers have version {theirs} of this package, but here is '
+                f'{version}: their results would not be comparable'
+            )
         jobs = make_jobs(client, command, args.bags, parameters, options, version)
         bar.reset(len(jobs))
         rows, reused = run_jobs(client, jobs, args.out, run_job, bar.update)
@@ -137,20 +161,21 @@ def _options(args: argparse.Namespace) -> tuple[tuple[str, ...], str | None]:
             raise InputError(f'--options must not have {word}: batch itself sets it')
     try:
         make_parser(command).parse_args([command, 'BAG', *options])
-    except SystemExit as end:   # argparse has printed the reason
+    except SystemExit as end:  # argparse has printed the reason
         raise InputError(f'--options: {shlex.join(options)} are no options of {command}') from end
     return tuple(options), text
 
 
 # -- Jobs: the bags, on the workers ---------------------------------------------------------------
 
+
 class Bag(NamedTuple):
     """A bag in the file system of the workers."""
 
     path: str
-    size: int   # of all its files [bytes]; -1 if there is none
-    changed_ns: int   # last change of its files
-    parameters: str   # text of the parameter file to use, that next to it; '' for none
+    size: int  # of all its files [bytes]; -1 if there is none
+    changed_ns: int  # last change of its files
+    parameters: str  # text of the parameter file to use, that next to it; '' for none
 
 
 class Job(NamedTuple):
@@ -158,9 +183,9 @@ class Job(NamedTuple):
 
     command: str
     bag: Bag
-    name: str   # of the folder of its results
+    name: str  # of the folder of its results
     options: tuple[str, ...]
-    version: str   # of this package
+    version: str  # of this package
 
     @property
     def fingerprint(self) -> str:
@@ -168,12 +193,22 @@ class Job(NamedTuple):
         values = [self.command, self.bag, self.options, self.version]
         return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
-    def row(self, state: str, message: str = '', seconds: float = 0.0,
-            metrics: Mapping[str, Any] | None = None) -> Row:
+    def row(
+        self,
+        state: str,
+        message: str = '',
+        seconds: float = 0.0,
+        metrics: Mapping[str, Any] | None = None,
+    ) -> Row:
         """What came of it: why it is not done, wall time, values by column."""
-        return {'bag': self.bag.path, 'name': self.name, 'state': state,
-                'message': ' '.join(message.split()), 'seconds': round(seconds, 3),
-                **(metrics or {})}
+        return {
+            'bag': self.bag.path,
+            'name': self.name,
+            'state': state,
+            'message': ' '.join(message.split()),
+            'seconds': round(seconds, 3),
+            **(metrics or {}),
+        }
 
 
 def find_bags(paths: Sequence[str]) -> list[Bag]:
@@ -181,16 +216,27 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
     found: dict[str, Bag] = {}
     for pattern in paths:
         # A glob also matches parameter files and other folders.
-        matching = sorted(path for path in map(Path, glob.glob(pattern))  # noqa: PTH207 any root
-                          if (path / 'metadata.yaml').is_file() or path.suffix in _BAG_SUFFIXES)
+        matching = sorted(
+            path
+            for path in map(Path, glob.glob(pattern))  # noqa: PTH207 any root
+            if (path / 'metadata.yaml').is_file() or path.suffix in _BAG_SUFFIXES
+        )
         for path in matching or [Path(pattern)]:
-            states = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])
-                      if file.is_file()]
+            states = [
+                file.stat()
+                for file in (path.iterdir() if path.is_dir() else [path])
+                if file.is_file()
+            ]
             text = path.with_name(f'{path.name if path.is_dir() else path.stem}.yaml')
-            found.setdefault(str(path), Bag(
-                str(path), sum(state.st_size for state in states) if states else -1,
-                max((state.st_mtime_ns for state in states), default=0),
-                text.read_text(encoding='utf-8', errors='replace') if text.is_file() else ''))
+            found.setdefault(
+                str(path),
+                Bag(
+                    str(path),
+                    sum(state.st_size for state in states) if states else -1,
+                    max((state.st_mtime_ns for state in states), default=0),
+                    text.read_text(encoding='utf-8', errors='replace') if text.is_file() else '',
+                ),
+            )
     return list(found.values())
 
 
@@ -203,15 +249,28 @@ def unique_names(paths: Sequence[str]) -> list[str]:
     return ['__'.join(name.parts) for name in (short if len({*short}) == len(short) else long)]
 
 
-def make_jobs(client: Any, command: str, paths: Sequence[str], parameters: str | None,
-              options: tuple[str, ...], version: str) -> list[Job]:
+def make_jobs(
+    client: Any,
+    command: str,
+    paths: Sequence[str],
+    parameters: str | None,
+    options: tuple[str, ...],
+    version: str,
+) -> list[Job]:
     """Jobs for bags, or globs of them; `parameters`: None for the file next to each bag."""
     bags: list[Bag] = client.submit(find_bags, paths, pure=False).result()
     if all(bag.size < 0 for bag in bags):
         raise MissingInputError(f'the workers find no bag at {", ".join(paths)}')
-    return [Job(command, bag if parameters is None else bag._replace(parameters=parameters), name,
-                options, version)
-            for bag, name in zip(bags, unique_names([bag.path for bag in bags]), strict=True)]
+    return [
+        Job(
+            command,
+            bag if parameters is None else bag._replace(parameters=parameters),
+            name,
+            options,
+            version,
+        )
+        for bag, name in zip(bags, unique_names([bag.path for bag in bags]), strict=True)
+    ]
 
 
 def run_job(job: Job) -> tuple[Row, Files]:
@@ -227,7 +286,7 @@ def run_job(job: Job) -> tuple[Row, Files]:
             parameters.write_text(job.bag.parameters, encoding='utf-8')
             words += ['--params', str(parameters)]
         words += [*(['--out', str(out)] if job.command != 'check' else []), *job.options]
-        arguments, sys.argv = sys.argv, ['rs_relpose', *words]   # for summary.json
+        arguments, sys.argv = sys.argv, ['rs_relpose', *words]  # for summary.json
         try:
             with redirect_stderr(io.StringIO()):
                 results = _WORK[job.command](make_parser(job.command).parse_args(words))
@@ -243,40 +302,68 @@ def run_job(job: Job) -> tuple[Row, Files]:
             state, message = FAILED, str(error)
         finally:
             sys.argv = arguments
-        files |= {str(file.relative_to(out)): file.read_bytes()
-                  for file in sorted(out.rglob('*')) if file.is_file()}
+        files |= {
+            str(file.relative_to(out)): file.read_bytes()
+            for file in sorted(out.rglob('*'))
+            if file.is_file()
+        }
     return job.row(state, message, time.perf_counter() - started, metrics), files
 
 
 # -- Columns of the table, and messages, from the results of one bag ------------------------------
 
 # Parameters of a calibration that are one number: value, sigma, observable, remark.
-_CALIBRATED = ('readout_time_s', 'time_offset_s', 'focal_px', 'gyro_bias_rad_per_s.0',
-               'gyro_bias_rad_per_s.1', 'gyro_bias_rad_per_s.2')
+_CALIBRATED = (
+    'readout_time_s',
+    'time_offset_s',
+    'focal_px',
+    'gyro_bias_rad_per_s.0',
+    'gyro_bias_rad_per_s.1',
+    'gyro_bias_rad_per_s.2',
+)
 _ROTATION = 'rotation_from_axis_map_rad'
 
 # Command -> column -> place in the results.
 _COLUMNS: Mapping[str, Mapping[str, str]] = {
     'calibrate': {
         'shutter': 'shutter',
-        **{name.replace('.', '_') + suffix: f'{name}.{part}' for name in _CALIBRATED
-           for suffix, part in (
-               ('', 'value'), ('_sigma', 'sigma'), ('_observable', 'observable'))},
+        **{
+            name.replace('.', '_') + suffix: f'{name}.{part}'
+            for name in _CALIBRATED
+            for suffix, part in (('', 'value'), ('_sigma', 'sigma'), ('_observable', 'observable'))
+        },
         **{f'quat_{axis}': f'quat_cam_imu_xyzw.{i}' for i, axis in enumerate('xyzw')},
-        **{f'rotation_{axis}_sigma_rad': f'rotation_sigma_rad.{i}'
-           for i, axis in enumerate('xyz')},
+        **{
+            f'rotation_{axis}_sigma_rad': f'rotation_sigma_rad.{i}' for i, axis in enumerate('xyz')
+        },
         'rotation_observable': f'{_ROTATION}.observable',
-        'frames': 'frames', 'pixel_sigma': 'pixel_sigma'},
+        'frames': 'frames',
+        'pixel_sigma': 'pixel_sigma',
+    },
     'replay': {
-        'pairs': 'pairs.total', 'answered': 'pairs.answered', 'health': 'health.state',
-        **{name: f'errors_against_truth.{name}' for name in (
-            'rotation_median_deg', 'rotation_p90_deg', 'translation_median_deg',
-            'translation_p90_deg')},
+        'pairs': 'pairs.total',
+        'answered': 'pairs.answered',
+        'health': 'health.state',
+        **{
+            name: f'errors_against_truth.{name}'
+            for name in (
+                'rotation_median_deg',
+                'rotation_p90_deg',
+                'translation_median_deg',
+                'translation_p90_deg',
+            )
+        },
         'pairs_with_truth': 'errors_against_truth.pairs',
-        **{f'{name}_median': f'medians.{name}' for name in (
-            'inliers', 'residual_rms_px', 'rotation_difference_to_gyro_deg')},
-        'frames': 'frames.in_bag', 'frames_processed': 'frames.processed',
-        'bag_s': 'timing.bag_s', 'processing_per_frame_ms': 'timing.processing_per_frame_ms'}}
+        **{
+            f'{name}_median': f'medians.{name}'
+            for name in ('inliers', 'residual_rms_px', 'rotation_difference_to_gyro_deg')
+        },
+        'frames': 'frames.in_bag',
+        'frames_processed': 'frames.processed',
+        'bag_s': 'timing.bag_s',
+        'processing_per_frame_ms': 'timing.processing_per_frame_ms',
+    },
+}
 
 
 def metrics_of(command: str, results: Mapping[str, Any]) -> dict[str, Any]:
@@ -299,24 +386,39 @@ def _at(results: Any, place: str) -> Any:
 def _problems(command: str, results: Mapping[str, Any]) -> str:
     """What a completed command found, in words; empty if its exit code is 0."""
     if command == 'check':
-        problems = [f'{finding["name"]}: {finding["text"]}' for finding in results['findings']
-                    if finding['verdict'] == 'failure']
+        problems = [
+            f'{finding["name"]}: {finding["text"]}'
+            for finding in results['findings']
+            if finding['verdict'] == 'failure'
+        ]
     elif command == 'calibrate':
-        parts = {**{name: _at(results, name) for name in _CALIBRATED},
-                 'rotation': results[_ROTATION]}
-        problems = [f'{name} is not observable: {part["remark"]}' for name, part in parts.items()
-                    if part is not None and not part['determined']]
+        parts = {
+            **{name: _at(results, name) for name in _CALIBRATED},
+            'rotation': results[_ROTATION],
+        }
+        problems = [
+            f'{name} is not observable: {part["remark"]}'
+            for name, part in parts.items()
+            if part is not None and not part['determined']
+        ]
     else:
-        problems = [finding['sentence'] for finding in results['health']['findings']
-                    if finding['state'] == 'wrong']
+        problems = [
+            finding['sentence']
+            for finding in results['health']['findings']
+            if finding['state'] == 'wrong'
+        ]
         if not results['pairs']['answered']:
-            counts = [f'{count} {status}' for status, count in
-                      results['pairs']['by_status'].items() if count]
+            counts = [
+                f'{count} {status}'
+                for status, count in results['pairs']['by_status'].items()
+                if count
+            ]
             problems.append(f'no pair has a pose: {", ".join(counts) or "there was none"}')
     return '; '.join(problems)
 
 
 # -- The cluster ----------------------------------------------------------------------------------
+
 
 @contextmanager
 def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
@@ -326,14 +428,21 @@ def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         if scheduler is None:
-            stack.enter_context(dask.config.set(
-                {'distributed.scheduler.allowed-failures': _ALLOWED_DEATHS}))
+            stack.enter_context(
+                dask.config.set({'distributed.scheduler.allowed-failures': _ALLOWED_DEATHS})
+            )
             # Loopback only; no dashboard, whose port others may use.
-            scheduler = stack.enter_context(distributed.LocalCluster(
-                n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
-                processes=True, host='127.0.0.1', dashboard_address=None,
-                scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-                silence_logs=logging.CRITICAL))
+            scheduler = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=workers or len(os.sched_getaffinity(0)),
+                    threads_per_worker=1,
+                    processes=True,
+                    host='127.0.0.1',
+                    dashboard_address=None,
+                    scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+                    silence_logs=logging.CRITICAL,
+                )
+            )
         elif workers is not None:
             raise InputError('--workers is for local processes: a running cluster has its own')
         try:
@@ -347,9 +456,13 @@ def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         yield client
 
 
-def run_jobs(client: Any, jobs: Sequence[Job], folder: Path,
-             work: Callable[[Job], tuple[Row, Files]],
-             on_bag: Callable[[], object] = lambda: None) -> tuple[list[Row], int]:
+def run_jobs(
+    client: Any,
+    jobs: Sequence[Job],
+    folder: Path,
+    work: Callable[[Job], tuple[Row, Files]],
+    on_bag: Callable[[], object] = lambda: None,
+) -> tuple[list[Row], int]:
     """Rows of the jobs, written with their files into a folder; how many an earlier run had.
 
     `work` runs on the workers. A worker that dies is replaced, and its job repeated.
@@ -375,8 +488,11 @@ def run_jobs(client: Any, jobs: Sequence[Job], folder: Path,
         try:
             rows[job], files = future.result()
         except distributed.scheduler.KilledWorker:
-            rows[job] = job.row(LOST, f'each of {_ALLOWED_DEATHS + 1} workers died over this bag: '
-                                'out of memory, or a fault of a library')
+            rows[job] = job.row(
+                LOST,
+                f'each of {_ALLOWED_DEATHS + 1} workers died over this bag: '
+                'out of memory, or a fault of a library',
+            )
         except Exception as error:  # noqa: BLE001 any error of a worker is the row of its bag
             rows[job] = job.row(FAILED, f'{type(error).__name__}: {error}')
         store(job, rows[job], files, folder)
@@ -390,12 +506,16 @@ def run_jobs(client: Any, jobs: Sequence[Job], folder: Path,
 
 # -- The folder of the results --------------------------------------------------------------------
 
+
 def earlier(job: Job, folder: Path) -> Row | None:
     """The row of an earlier run of the same job, if another run would not change it."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         entry = json.loads((folder / job.name / _JOB_FILE).read_text(encoding='utf-8'))
-        if (entry['fingerprint'] == job.fingerprint and entry['row']['state'] in _LASTING
-                and all((folder / job.name / name).is_file() for name in entry['files'])):
+        if (
+            entry['fingerprint'] == job.fingerprint
+            and entry['row']['state'] in _LASTING
+            and all((folder / job.name / name).is_file() for name in entry['files'])
+        ):
             return dict(entry['row'])
     return None
 
@@ -416,25 +536,40 @@ def store(job: Job, row: Row, files: Files, folder: Path) -> None:
 def write_table(rows: Sequence[Row], folder: Path) -> None:
     """One row for each bag; metrics that a bag does not have are empty."""
     with written(folder / RESULTS_FILE) as file:
-        table = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)),
-                               lineterminator='\n')
+        table = csv.DictWriter(
+            file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator='\n'
+        )
         table.writeheader()
         table.writerows(rows)
 
 
 def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> list[str]:
     """Write summary.json and the picture of a run with jobs such as this; lines to print."""
-    combined = combine([row for row in rows if job.command == 'calibrate'
-                        and row['state'] in (DONE, FINDINGS)])
+    combined = combine(
+        [row for row in rows if job.command == 'calibrate' and row['state'] in (DONE, FINDINGS)]
+    )
     states = {state: [row['state'] for row in rows].count(state) for state in STATES}
     with written(folder / SUMMARY_FILE) as file:
-        file.write(json.dumps({
-            'command': job.command, 'options': job.options, 'version': job.version,
-            'bags': len(rows), 'states': states, 'combined': combined}, indent=1) + '\n')
+        file.write(
+            json.dumps(
+                {
+                    'command': job.command,
+                    'options': job.options,
+                    'version': job.version,
+                    'bags': len(rows),
+                    'states': states,
+                    'combined': combined,
+                },
+                indent=1,
+            )
+            + '\n'
+        )
     draw(job.command, rows, combined['figures'], folder / PICTURE_FILE)
-    lines = [f'{len(rows)} bags: '
-             + ', '.join(f'{count} {state}' for state, count in states.items() if count)
-             + (f'; {reused} of them from an earlier run' if reused else '')]
+    lines = [
+        f'{len(rows)} bags: '
+        + ', '.join(f'{count} {state}' for state, count in states.items() if count)
+        + (f'; {reused} of them from an earlier run' if reused else '')
+    ]
     unfinished = [row for row in rows if row['state'] != DONE]
     lines += ['{state}: {bag}: {message}'.format(**row) for row in unfinished[:_MOST_LINES]]
     if len(unfinished) > _MOST_LINES:
@@ -446,12 +581,14 @@ def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> l
                 f'{one["figure"]}: {one["mean"]:.6g} +- {one["sigma"]:.2g}, of {degrees + 1} '
                 f'bags, chi2 {one["chi2"]:.3g} of {degrees} degrees of freedom'
                 + (f' (sigma times {scale:.2g})' if scale > 1.0 else '')
-                + (f'; outliers: {", ".join(one["outliers"])}' if one['outliers'] else ''))
+                + (f'; outliers: {", ".join(one["outliers"])}' if one['outliers'] else '')
+            )
     if combined['quat_cam_imu_xyzw'] is not None:
         numbers = ', '.join(f'{value:.6f}' for value in combined['quat_cam_imu_xyzw'])
         lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
-    lines.append(f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for '
-                 'each bag')
+    lines.append(
+        f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for each bag'
+    )
     return lines
 
 
@@ -461,8 +598,9 @@ def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> l
 _OUTLIER = 3.0
 
 
-def weighted_mean(metric: str, bags: Sequence[str], values: ArrayLike,
-                  sigmas: ArrayLike) -> dict[str, Any]:
+def weighted_mean(
+    metric: str, bags: Sequence[str], values: ArrayLike, sigmas: ArrayLike
+) -> dict[str, Any]:
     """Combine independent measurements (N,) with their sigmas (N,), as in summary.json.
 
     The worst one is an outlier, as long as it is more than 3 sigma from the weighted mean of the
@@ -478,17 +616,24 @@ def weighted_mean(metric: str, bags: Sequence[str], values: ArrayLike,
 
     while len(kept) > 2:
         others = [mean_of([i for i in kept if i != one]) for one in kept]
-        distances = [abs(x[one] - mean) / np.hypot(s[one], sigma)
-                     for one, (mean, sigma) in zip(kept, others, strict=True)]
+        distances = [
+            abs(x[one] - mean) / np.hypot(s[one], sigma)
+            for one, (mean, sigma) in zip(kept, others, strict=True)
+        ]
         if max(distances) <= _OUTLIER:
             break
         del kept[int(np.argmax(distances))]
     mean, sigma = mean_of(kept)
     chi2, degrees = float((((x[kept] - mean) / s[kept]) ** 2).sum()), len(kept) - 1
-    return {'figure': metric, 'mean': mean,
-            'sigma': sigma * math.sqrt(max(1.0, chi2 / degrees)) if degrees else sigma,
-            'chi2': chi2, 'degrees_of_freedom': degrees, 'bags': list(bags),
-            'outliers': [bag for i, bag in enumerate(bags) if i not in kept]}
+    return {
+        'figure': metric,
+        'mean': mean,
+        'sigma': sigma * math.sqrt(max(1.0, chi2 / degrees)) if degrees else sigma,
+        'chi2': chi2,
+        'degrees_of_freedom': degrees,
+        'bags': list(bags),
+        'outliers': [bag for i, bag in enumerate(bags) if i not in kept],
+    }
 
 
 def combine(rows: Sequence[Row]) -> dict[str, Any]:
@@ -503,16 +648,29 @@ def combine(rows: Sequence[Row]) -> dict[str, Any]:
         good = [row for row in rows if row[f'{column}_observable']]
         names = [row['name'] for row in good]
         if good and metric != 'rotation':
-            combined.append(weighted_mean(metric, names, [row[column] for row in good],
-                                          [row[f'{column}_sigma'] for row in good]))
+            combined.append(
+                weighted_mean(
+                    metric,
+                    names,
+                    [row[column] for row in good],
+                    [row[f'{column}_sigma'] for row in good],
+                )
+            )
         elif good:
             rotations = Rotation.from_quat(
-                [[row[f'quat_{axis}'] for axis in 'xyzw'] for row in good])
+                [[row[f'quat_{axis}'] for axis in 'xyzw'] for row in good]
+            )
             near = rotations.mean()
             vectors = (rotations * near.inv()).as_rotvec()
-            of_axes = [weighted_mean(f'rotation_{axis}_rad', names, vectors[:, i],
-                                     [row[f'rotation_{axis}_sigma_rad'] for row in good])
-                       for i, axis in enumerate('xyz')]
+            of_axes = [
+                weighted_mean(
+                    f'rotation_{axis}_rad',
+                    names,
+                    vectors[:, i],
+                    [row[f'rotation_{axis}_sigma_rad'] for row in good],
+                )
+                for i, axis in enumerate('xyz')
+            ]
             mean = Rotation.from_rotvec([one['mean'] for one in of_axes]) * near
             quaternion = mean.as_quat(canonical=True).tolist()
             combined += [{**one, 'mean': 0.0} for one in of_axes]
@@ -522,14 +680,20 @@ def combine(rows: Sequence[Row]) -> dict[str, Any]:
 # The two columns of each command that are drawn, their factors and labels.
 _DRAWN = {
     'check': (('failure', 1.0, 'failures'), ('warning', 1.0, 'warnings')),
-    'calibrate': (('readout_time_s', 1e3, 'readout time [ms], 1 sigma'),
-                  ('time_offset_s', 1e3, 'time offset of row 0 [ms], 1 sigma')),
-    'replay': (('answered', 1.0, 'pairs with a pose'),
-               ('rotation_median_deg', 1.0, 'median error of the rotation [deg]'))}
+    'calibrate': (
+        ('readout_time_s', 1e3, 'readout time [ms], 1 sigma'),
+        ('time_offset_s', 1e3, 'time offset of row 0 [ms], 1 sigma'),
+    ),
+    'replay': (
+        ('answered', 1.0, 'pairs with a pose'),
+        ('rotation_median_deg', 1.0, 'median error of the rotation [deg]'),
+    ),
+}
 
 
-def draw(command: str, rows: Sequence[Row], combined: Sequence[Mapping[str, Any]],
-         path: Path) -> None:
+def draw(
+    command: str, rows: Sequence[Row], combined: Sequence[Mapping[str, Any]], path: Path
+) -> None:
     """Draw rows in their order; red: outliers of the mean, orange: unobservable values."""
     picture = Figure(figsize=(10.0, 1.2 + 0.3 * len(rows)), dpi=110, layout='constrained')
     both, means = picture.subplots(1, 2, sharey=True), {one['figure']: one for one in combined}
@@ -541,14 +705,28 @@ def draw(command: str, rows: Sequence[Row], combined: Sequence[Mapping[str, Any]
             axes.axvspan(factor * (mean - sigma), factor * (mean + sigma), color=BLUE, alpha=0.2)
         for y, row in enumerate(rows):
             if row.get(column) is not None:
-                colour = (ORANGE if not row.get(f'{column}_observable', True) else
-                          RED if row['name'] in outliers else BLUE)
-                axes.errorbar(factor * row[column], y, fmt='o', color=colour,
-                              xerr=factor * row.get(f'{column}_sigma', 0.0))
+                colour = (
+                    ORANGE
+                    if not row.get(f'{column}_observable', True)
+                    else RED
+                    if row['name'] in outliers
+                    else BLUE
+                )
+                axes.errorbar(
+                    factor * row[column],
+                    y,
+                    fmt='o',
+                    color=colour,
+                    xerr=factor * row.get(f'{column}_sigma', 0.0),
+                )
         axes.set_xlabel(label)
         axes.grid(axis='x', color='0.9')
-    both[0].set_yticks(range(len(rows)), [
-        row['name'][-40:] + ('' if row['state'] in (DONE, FINDINGS) else f' ({row["state"]})')
-        for row in rows])
+    both[0].set_yticks(
+        range(len(rows)),
+        [
+            row['name'][-40:] + ('' if row['state'] in (DONE, FINDINGS) else f' ({row["state"]})')
+            for row in rows
+        ],
+    )
     both[0].set_ylim(len(rows) - 0.4, -0.6)
     save_picture(picture, path)

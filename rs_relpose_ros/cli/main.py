@@ -18,30 +18,51 @@ PROGRAM = 'rs_relpose'
 # the overview needs neither OpenCV nor Numba. Commands of the laboratory, another package, are
 # found by name, so that the product does not depend on it.
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    'batch': ('rs_relpose_ros.cli.batch',
-              'check, calibrate or replay over many bags, on Dask'),
-    'benchmark': ('rs_relpose_lab.cli.benchmark',
-                  'measure accuracy and speed of the estimator: tables and plots'),
-    'check': ('rs_relpose_ros.cli.recordings:CHECK',
-              'check a bag for defects that degrade the poses, with suggested fixes'),
-    'calibrate': ('rs_relpose_ros.cli.recordings:CALIBRATE',
-                  'readout time, time offset, axes and gyro bias from a bag, without a target'),
-    'convert': ('rs_relpose_ros.cli.recordings:CONVERT',
-                'convert a recording of a camera or phone to a bag and its parameter file'),
-    'evaluate': ('rs_relpose_lab.cli.evaluate',
-                 'run the experiments of the paper: tables and box plots'),
-    'export': ('rs_relpose_ros.cli.poses:EXPORT',
-               'images, poses of rows and points for COLMAP, nerfstudio, gsplat and others'),
-    'odometry': ('rs_relpose_ros.cli.poses:ODOMETRY',
-                 'a metric path from a bag: relative poses and IMU in one graph'),
-    'pairs': ('rs_relpose_ros.cli.poses:PAIRS',
-              'relative poses of chosen pairs of images, such as loop closures'),
-    'replay': ('rs_relpose_ros.cli.poses:REPLAY',
-               'estimate relative poses from a bag: CSV, summary and pictures'),
-    'unroll': ('rs_relpose_ros.cli.recordings:UNROLL',
-               'derotate the images of a bag to the time of their middle row'),
-    'simulate': ('rs_relpose_lab.cli.simulate',
-                 'render rolling-shutter images and IMU of a known motion into a bag'),
+    'batch': ('rs_relpose_ros.cli.batch', 'check, calibrate or replay over many bags, on Dask'),
+    'benchmark': (
+        'rs_relpose_lab.cli.benchmark',
+        'measure accuracy and speed of the estimator: tables and plots',
+    ),
+    'check': (
+        'rs_relpose_ros.cli.recordings:CHECK',
+        'check a bag for defects that degrade the poses, with suggested fixes',
+    ),
+    'calibrate': (
+        'rs_relpose_ros.cli.recordings:CALIBRATE',
+        'readout time, time offset, axes and gyro bias from a bag, without a target',
+    ),
+    'convert': (
+        'rs_relpose_ros.cli.recordings:CONVERT',
+        'convert a recording of a camera or phone to a bag and its parameter file',
+    ),
+    'evaluate': (
+        'rs_relpose_lab.cli.evaluate',
+        'run the experiments of the paper: tables and box plots',
+    ),
+    'export': (
+        'rs_relpose_ros.cli.poses:EXPORT',
+        'images, poses of rows and points for COLMAP, nerfstudio, gsplat and others',
+    ),
+    'odometry': (
+        'rs_relpose_ros.cli.poses:ODOMETRY',
+        'a metric path from a bag: relative poses and IMU in one graph',
+    ),
+    'pairs': (
+        'rs_relpose_ros.cli.poses:PAIRS',
+        'relative poses of chosen pairs of images, such as loop closures',
+    ),
+    'replay': (
+        'rs_relpose_ros.cli.poses:REPLAY',
+        'estimate relative poses from a bag: CSV, summary and pictures',
+    ),
+    'unroll': (
+        'rs_relpose_ros.cli.recordings:UNROLL',
+        'derotate the images of a bag to the time of their middle row',
+    ),
+    'simulate': (
+        'rs_relpose_lab.cli.simulate',
+        'render rolling-shutter images and IMU of a known motion into a bag',
+    ),
 }
 
 LABORATORY = 'the package rs_relpose_lab, which is not installed'
@@ -50,8 +71,13 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 
 # Errors of an unusable path of the user.
-_BAD_PATHS = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
-              NotADirectoryError)
+_BAD_PATHS = (
+    FileNotFoundError,
+    FileExistsError,
+    PermissionError,
+    IsADirectoryError,
+    NotADirectoryError,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -66,7 +92,7 @@ class Command(NamedTuple):
 
 def package_version() -> str:
     """Version of the installed package."""
-    with suppress(PackageNotFoundError):   # run from a source tree
+    with suppress(PackageNotFoundError):  # run from a source tree
         return version('rs_relpose_ros')
     return 'not installed'
 
@@ -86,9 +112,14 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
         prog=PROGRAM,
         description='Relative poses of rolling-shutter images, aided by an IMU: offline tools.',
         epilog=f'"{PROGRAM} COMMAND --help" describes a command. Exit codes: 0 done, 1 the work '
-               'ran and failed, 2 bad usage or bad input.')
-    parser.add_argument('--version', action='version', version=f'{PROGRAM} {package_version()}',
-                        help='print the version and exit')
+        'ran and failed, 2 bad usage or bad input.',
+    )
+    parser.add_argument(
+        '--version',
+        action='version',
+        version=f'{PROGRAM} {package_version()}',
+        help='print the version and exit',
+    )
     _add_verbose(parser, default=0)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, (_, one_line) in COMMANDS.items():
@@ -131,7 +162,8 @@ def _run(arguments: list[str]) -> int:
     # Numba and Matplotlib would fill pages at level DEBUG.
     for package in ('rs_relpose_ros', 'rs_relpose_lab'):
         logging.getLogger(package).setLevel(
-            {0: logging.WARNING, 1: logging.INFO}.get(args.verbose, logging.DEBUG))
+            {0: logging.WARNING, 1: logging.INFO}.get(args.verbose, logging.DEBUG)
+        )
     try:
         return int(load_command(args.command).run(args))
     except BrokenPipeError:
@@ -141,13 +173,19 @@ def _run(arguments: list[str]) -> int:
         if isinstance(error, _BAD_PATHS):
             return _report_error(f'error: {error.filename}: {error.strerror}', BAD_INPUT)
         # Another OSError, such as a full disk: the input was fine.
-        return _report_error(f'error: {error}',
-                             FAILED if isinstance(error, OSError) else BAD_INPUT)
+        return _report_error(
+            f'error: {error}', FAILED if isinstance(error, OSError) else BAD_INPUT
+        )
 
 
 def _add_verbose(parser: argparse.ArgumentParser, default: Any) -> None:
-    parser.add_argument('-v', '--verbose', action='count', default=default,
-                        help='log the progress; twice for details')
+    parser.add_argument(
+        '-v',
+        '--verbose',
+        action='count',
+        default=default,
+        help='log the progress; twice for details',
+    )
 
 
 def _report_error(message: str, code: int) -> int:

@@ -36,29 +36,50 @@ Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
 # Arguments by name, as of `ArgumentParser.add_argument`.
 Arguments = Mapping[str, Mapping[str, Any]]
 
-BAG: Arguments = {'bag': {
-    'metavar': 'BAG', 'type': Path, 'help': 'rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag '
-    'file'}}
+BAG: Arguments = {
+    'bag': {
+        'metavar': 'BAG',
+        'type': Path,
+        'help': 'rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file',
+    }
+}
 PARAMETERS: Arguments = {
-    '--params': {'metavar': 'FILE', 'type': Path,
-                 'help': "the node's parameter file (ROS format)"},
-    '--set': {'metavar': 'NAME=VALUE', 'action': 'append', 'default': [],
-              'help': 'set a parameter, after --params; may be repeated'}}
+    '--params': {
+        'metavar': 'FILE',
+        'type': Path,
+        'help': "the node's parameter file (ROS format)",
+    },
+    '--set': {
+        'metavar': 'NAME=VALUE',
+        'action': 'append',
+        'default': [],
+        'help': 'set a parameter, after --params; may be repeated',
+    },
+}
 # Of each field of `SensorTopics`; in a group of their own.
-TOPICS: Arguments = {f'--{role}-topic': {'metavar': 'TOPIC', 'default': '', 'help': text}
-                     for role, text in {
-    'image': 'Image or CompressedImage', 'camera-info': 'CameraInfo',
-    'imu': 'Imu: gyro, and accelerometer unless it is separate',
-    'accel': 'Imu of a separate accelerometer',
-    'truth': 'PoseStamped: ground truth of the camera'}.items()}
+TOPICS: Arguments = {
+    f'--{role}-topic': {'metavar': 'TOPIC', 'default': '', 'help': text}
+    for role, text in {
+        'image': 'Image or CompressedImage',
+        'camera-info': 'CameraInfo',
+        'imu': 'Imu: gyro, and accelerometer unless it is separate',
+        'accel': 'Imu of a separate accelerometer',
+        'truth': 'PoseStamped: ground truth of the camera',
+    }.items()
+}
 SENSOR_TOPICS = {name: values for name, values in TOPICS.items() if name != '--truth-topic'}
 
 
 def out(suffix: str) -> Arguments:
     """--out, which is BAGNAME_`suffix` by default."""
-    return {'--out': {
-        'metavar': 'DIR', 'type': Path, 'help': f'directory of the results (default: '
-        f'BAGNAME_{suffix} in the current one); those of an earlier run are replaced'}}
+    return {
+        '--out': {
+            'metavar': 'DIR',
+            'type': Path,
+            'help': f'directory of the results (default: '
+            f'BAGNAME_{suffix} in the current one); those of an earlier run are replaced',
+        }
+    }
 
 
 def of_run(suffix: str) -> Arguments:
@@ -68,18 +89,25 @@ def of_run(suffix: str) -> Arguments:
 
 def declared(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
     """A function that declares arguments."""
+
     def add(parser: argparse.ArgumentParser) -> None:
         topics = None
         for name, values in arguments.items():
             if name in TOPICS:
                 topics = topics or parser.add_argument_group(
-                    'topics', 'found by type where that is unambiguous')
+                    'topics', 'found by type where that is unambiguous'
+                )
             (topics if name in TOPICS and topics else parser).add_argument(name, **values)
+
     return add
 
 
-def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
-               calibration: Mapping[str, Any] | None = None) -> tuple[Path, Made]:
+def run_on_bag(
+    args: argparse.Namespace,
+    suffix: str,
+    work: Work[Made],
+    calibration: Mapping[str, Any] | None = None,
+) -> tuple[Path, Made]:
     """Run `work` and write summary.json; `calibration`: parameters where `args` give no others."""
     parameters = read_parameters(args.params, args.set)
     parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
@@ -91,11 +119,19 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
     summary = {
         'bag': str(args.bag),
         'topics': {role: topic and topic.name for role, topic in by_role.items()},
-        **results.metrics, 'parameters': parameters.to_mapping(), 'command': sys.argv,
-        'versions': {'rs_relpose_ros': package_version(), 'python': platform.python_version(),
-                     'numpy': np.__version__, 'scipy': scipy.__version__,
-                     'opencv': cv2.__version__, 'numba': numba.__version__}}
-    with written(folder / SUMMARY_FILE) as file:   # JSON has no NaN
+        **results.metrics,
+        'parameters': parameters.to_mapping(),
+        'command': sys.argv,
+        'versions': {
+            'rs_relpose_ros': package_version(),
+            'python': platform.python_version(),
+            'numpy': np.__version__,
+            'scipy': scipy.__version__,
+            'opencv': cv2.__version__,
+            'numba': numba.__version__,
+        },
+    }
+    with written(folder / SUMMARY_FILE) as file:  # JSON has no NaN
         file.write(json.dumps(summary, indent=2, allow_nan=False) + '\n')
     return folder, results
 
@@ -113,26 +149,35 @@ def warn_unused(reasons: Mapping[str, int], what: str = 'not used') -> None:
 
 def topic_options(args: argparse.Namespace) -> dict[str, str]:
     """Names by role, of the options `TOPICS`."""
-    return {name.removesuffix('_topic'): value for name, value in vars(args).items()
-            if name.endswith('_topic')}
+    return {
+        name.removesuffix('_topic'): value
+        for name, value in vars(args).items()
+        if name.endswith('_topic')
+    }
 
 
 @contextmanager
-def opened(args: argparse.Namespace,
-           parameters: Parameters) -> Iterator[tuple[Bag, SensorTopics, Parameters]]:
+def opened(
+    args: argparse.Namespace, parameters: Parameters
+) -> Iterator[tuple[Bag, SensorTopics, Parameters]]:
     """A bag and its topics, and `parameters` with the extrinsics of its transforms.
 
     A progress bar shows its images. `args` have `bag` and the options of topics and parameters.
     """
     with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
+        topics = bag.find_topics(
+            topic_options(args), needs_camera_info=not parameters.intrinsics.given
+        )
         parameters, contradiction = with_extrinsics(bag, topics, parameters)
         if contradiction:
             _logger.warning('%s', contradiction)
         neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
-        need_sensor_parameters(parameters, f'use --params {neighbour}, the file next to the bag'
-                               if args.params is None and neighbour.is_file() else '')
+        need_sensor_parameters(
+            parameters,
+            f'use --params {neighbour}, the file next to the bag'
+            if args.params is None and neighbour.is_file()
+            else '',
+        )
         with image_progress(bag, topics.image, bag_name(args.bag)):
             yield bag, topics, parameters
 
@@ -145,8 +190,9 @@ def bag_name(bag: Path) -> str:
 
 def progress_bar(total: int, unit: str, description: str | None = None) -> tqdm:
     """Return a progress bar, invisible unless stderr is a terminal."""
-    return tqdm(total=total, unit=unit, desc=description, leave=False,
-                disable=not sys.stderr.isatty())
+    return tqdm(
+        total=total, unit=unit, desc=description, leave=False, disable=not sys.stderr.isatty()
+    )
 
 
 def image_progress(bag: Bag, image: Topic, description: str) -> tqdm:

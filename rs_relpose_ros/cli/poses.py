@@ -32,14 +32,25 @@ def replay_bag(args: argparse.Namespace) -> tuple[Path, replay.ReplayOutcome]:
     """Replay and write the files of the command, into the folder that is returned."""
     stamps = None if args.stamps is None else replay.read_stamps(args.stamps)
     return options.run_on_bag(
-        args, 'relpose', lambda folder, bag, topics, parameters: replay.replay_into(
-            folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
-            with_bag=args.with_bag), _calibration(args) if args.calibrate else {})
+        args,
+        'relpose',
+        lambda folder, bag, topics, parameters: replay.replay_into(
+            folder,
+            bag,
+            topics,
+            parameters,
+            stamps=stamps,
+            pictures=not args.no_pictures,
+            with_bag=args.with_bag,
+        ),
+        _calibration(args) if args.calibrate else {},
+    )
 
 
 def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     """Calibrate from the bag of `args`; the parameters. InputError if one is not determined."""
     from rs_relpose_ros.cli.recordings import calibrate_bag, CALIBRATION_FILE
+
     folder = options.out_folder(args, 'relpose') / 'calibration'
     words = ['calibrate', str(args.bag), '--out', str(folder)]
     for role, topic in options.topic_options(args).items():
@@ -66,31 +77,53 @@ def _print_replay(outcome: replay.ReplayOutcome) -> None:
     metrics = outcome.metrics
     pairs, frames = metrics['pairs'], metrics['frames']
     refused = sum(frames['refused'].values()) + frames['failed']
-    print(f'{frames["processed"]} of {frames["in_bag"]} images processed'
-          + (f', {refused} refused' if refused else '')
-          + f' ({_text(metrics["timing"]["processing_per_frame_ms"], "ms per image")})')
-    print(f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
-          + ''.join(f', {count} {status}' for status, count in pairs['by_status'].items()
-                    if count and status != 'OK'))
+    print(
+        f'{frames["processed"]} of {frames["in_bag"]} images processed'
+        + (f', {refused} refused' if refused else '')
+        + f' ({_text(metrics["timing"]["processing_per_frame_ms"], "ms per image")})'
+    )
+    print(
+        f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
+        + ''.join(
+            f', {count} {status}'
+            for status, count in pairs['by_status'].items()
+            if count and status != 'OK'
+        )
+    )
     if not pairs['total']:
-        print('no keyframe pair: the bag is shorter than a keyframe interval, or too few frames '
-              'could be used')
+        print(
+            'no keyframe pair: the bag is shorter than a keyframe interval, or too few frames '
+            'could be used'
+        )
     elif not pairs['answered']:
         # The reason of suppressed poses follows with the findings.
-        reasons = sorted({record.pose.reason for record in outcome.records
-                          if record.pose.status.value != 'WITHHELD'})
+        reasons = sorted(
+            {
+                record.pose.reason
+                for record in outcome.records
+                if record.pose.status.value != 'WITHHELD'
+            }
+        )
         for reason in reasons[:_MOST_REASONS]:
             print(f'no pose: {reason}')
     _print_errors(metrics['errors_against_truth'])
     if pairs['answered']:
         medians = metrics['medians']
-        print(f'medians: {_text(medians["inliers"], "inliers")}, residual '
-              f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
-              f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}')
+        print(
+            f'medians: {_text(medians["inliers"], "inliers")}, residual '
+            f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
+            f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}'
+        )
         known = metrics['baselines']['known']
-        print(f'baseline in metres: of {known} of {pairs["answered"]} poses'
-              + (f', with a median sigma of '
-                 f'{100.0 * metrics["baselines"]["log_sigma_median"]:.0f} %' if known else ''))
+        print(
+            f'baseline in metres: of {known} of {pairs["answered"]} poses'
+            + (
+                f', with a median sigma of '
+                f'{100.0 * metrics["baselines"]["log_sigma_median"]:.0f} %'
+                if known
+                else ''
+            )
+        )
         for reason, count in metrics['baselines']['not_known'].items():
             print(f'{reason} ({count} poses)')
     _print_health(outcome)
@@ -106,22 +139,29 @@ def _print_health(outcome: replay.ReplayOutcome) -> None:
     if not health.findings:
         print('health: unknown: there was no pair to evaluate')
         return
-    observed, unobserved = (', '.join(finding.quantity for finding in health.findings
-                                      if finding.observable is observable)
-                            for observable in (True, False))
+    observed, unobserved = (
+        ', '.join(
+            finding.quantity for finding in health.findings if finding.observable is observable
+        )
+        for observable in (True, False)
+    )
     if not unobserved:
         print(f'health: ok ({observed} observed)')
     else:
-        print(f'health: unknown: {unobserved} not observable in this motion'
-              + (f' ({observed} ok)' if observed else ''))
+        print(
+            f'health: unknown: {unobserved} not observable in this motion'
+            + (f' ({observed} ok)' if observed else '')
+        )
 
 
 def _print_errors(errors: Mapping[str, float] | None) -> None:
     if errors:
-        print(f'against the ground truth (median, 90 %): rotation '
-              f'{errors["rotation_median_deg"]:.3g}, {errors["rotation_p90_deg"]:.3g} deg; '
-              f'direction of translation {errors["translation_median_deg"]:.3g}, '
-              f'{errors["translation_p90_deg"]:.3g} deg')
+        print(
+            f'against the ground truth (median, 90 %): rotation '
+            f'{errors["rotation_median_deg"]:.3g}, {errors["rotation_p90_deg"]:.3g} deg; '
+            f'direction of translation {errors["translation_median_deg"]:.3g}, '
+            f'{errors["translation_p90_deg"]:.3g} deg'
+        )
 
 
 def _text(value: Any, unit: str) -> str:
@@ -135,28 +175,46 @@ REPLAY = Command(
     "ground truth of the camera (geometry_msgs/PoseStamped of the optical frame, IMU's clock). "
     'Translations are unit vectors. Reports configured parameters (axes, time_offset, ...) that '
     'contradict images and IMU. Exit code 1: the bag was processed, but no pair has a pose, or '
-    'one of these parameters is wrong.', options.declared({
-        **options.of_run('relpose'),
-        '--stamps': {
-            'metavar': 'FILE', 'type': Path, 'help': 'use only the frames whose stamps [ns] are '
-            'in FILE, one per line, as the parameter stamps_file of a live node wrote them: the '
-            'poses are then equal to its poses, bit by bit'},
-        '--calibrate': {
-            'action': 'store_true', 'help': 'first calibrate from the bag into OUT/calibration, '
-            'as `rs_relpose calibrate` does; parameters that are given stay'},
-        '--no-pictures': {'action': 'store_true', 'help': 'tables and summary only'},
-        '--bag': {'dest': 'with_bag', 'action': 'store_true',
-                  'help': "write the node's topics as an MCAP bag, too"}}), _replay)
+    'one of these parameters is wrong.',
+    options.declared(
+        {
+            **options.of_run('relpose'),
+            '--stamps': {
+                'metavar': 'FILE',
+                'type': Path,
+                'help': 'use only the frames whose stamps [ns] are '
+                'in FILE, one per line, as the parameter stamps_file of a live node wrote them: '
+                'the '
+                'poses are then equal to its poses, bit by bit',
+            },
+            '--calibrate': {
+                'action': 'store_true',
+                'help': 'first calibrate from the bag into OUT/calibration, '
+                'as `rs_relpose calibrate` does; parameters that are given stay',
+            },
+            '--no-pictures': {'action': 'store_true', 'help': 'tables and summary only'},
+            '--bag': {
+                'dest': 'with_bag',
+                'action': 'store_true',
+                'help': "write the node's topics as an MCAP bag, too",
+            },
+        }
+    ),
+    _replay,
+)
 
 
 def _pairs(args: argparse.Namespace) -> int:
     pairs = replay.read_pairs(args.list)
 
-    def work(folder: Path, bag: Bag, topics: SensorTopics,
-             parameters: Parameters) -> replay.ReplayOutcome:
+    def work(
+        folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters
+    ) -> replay.ReplayOutcome:
         if args.list.resolve() == (folder / POSES.file).resolve():
-            raise InputError(f'the results would replace the list {args.list}: choose another '
-                             'directory with --out')
+            raise InputError(
+                f'the results would replace the list {args.list}: choose another '
+                'directory with --out'
+            )
         return replay.pairs_into(folder, bag, topics, parameters, pairs)
 
     folder, outcome = options.run_on_bag(args, 'pairs', work)
@@ -180,10 +238,20 @@ PAIRS = Command(
     'a row for each row of the list, in its order: the columns of replay and the reason of a pair '
     'without a pose; summary.json; and errors.csv if the bag contains ground truth of the camera. '
     'The configured parameters are used as they are: run check or replay first. Exit code 1: no '
-    'pair has a pose.', options.declared({
-        **options.of_run('pairs'),
-        '--list': {'metavar': 'FILE', 'type': Path, 'required': True,
-                   'help': 'the pairs (CSV): stamps of their images [ns]'}}), _pairs)
+    'pair has a pose.',
+    options.declared(
+        {
+            **options.of_run('pairs'),
+            '--list': {
+                'metavar': 'FILE',
+                'type': Path,
+                'required': True,
+                'help': 'the pairs (CSV): stamps of their images [ns]',
+            },
+        }
+    ),
+    _pairs,
+)
 
 
 def rate_in_hertz(text: str) -> float:
@@ -198,40 +266,53 @@ def _odometry_of(args: argparse.Namespace, **how: Any) -> tuple[Path, Any]:
     """Folder and outcome of the odometry; prints its warnings, and why it did not start."""
     need_gtsam()
     from rs_relpose_ros.odometry.offline import odometry_into
+
     folder, outcome = options.run_on_bag(args, 'odometry', partial(odometry_into, **how))
     for text in outcome.warnings:
         print(text)
     if not outcome.live:
-        print('odometry did not start:', outcome.blocking_reason or 'it needs some seconds of '
-              'motion, or standstill, and informative pairs')
+        print(
+            'odometry did not start:',
+            outcome.blocking_reason
+            or 'it needs some seconds of motion, or standstill, and informative pairs',
+        )
     return folder, outcome
 
 
 def _odometry(args: argparse.Namespace) -> int:
     folder, outcome = _odometry_of(args, rate=args.rate, loops=args.loops)
     from rs_relpose_ros.odometry import offline, rows
+
     metrics = outcome.metrics
     pairs = metrics['pairs']
-    print(f'{metrics["keyframes"]} keyframes of {pairs["pairs"]} pairs over '
-          f'{metrics["length_m"]:.1f} m'
-          + (f', {pairs["contradicting"]} pairs rejected' if pairs['contradicting'] else '')
-          + (f', lost {len(metrics["lost"])} times' if metrics['lost'] else ''))
+    print(
+        f'{metrics["keyframes"]} keyframes of {pairs["pairs"]} pairs over '
+        f'{metrics["length_m"]:.1f} m'
+        + (f', {pairs["contradicting"]} pairs rejected' if pairs['contradicting'] else '')
+        + (f', lost {len(metrics["lost"])} times' if metrics['lost'] else '')
+    )
     if metrics['health'] in ('suspect', 'wrong'):
         print(f'health: {metrics["health"]}: "rs_relpose replay" reports the parameter')
     if loops := metrics['loops']:
-        print(f'loops: {loops["offered"]} offered, {loops["related"]} related, {loops["taken"]} '
-              f'taken; keyframes shift by {loops["shift_m"]:.3f} m (rms), at most '
-              f'{loops["largest_shift_m"]:.3f} m; from the end to the start '
-              f'{loops["end_to_start_without_m"]:.3f} m without, {loops["end_to_start_m"]:.3f} m '
-              'with loops')
+        print(
+            f'loops: {loops["offered"]} offered, {loops["related"]} related, {loops["taken"]} '
+            f'taken; keyframes shift by {loops["shift_m"]:.3f} m (rms), at most '
+            f'{loops["largest_shift_m"]:.3f} m; from the end to the start '
+            f'{loops["end_to_start_without_m"]:.3f} m without, {loops["end_to_start_m"]:.3f} m '
+            'with loops'
+        )
     for trajectory in ('live', 'smoothed'):
         if errors := metrics[trajectory]:
-            print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
-                  f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
+            print(
+                f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
+                f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %'
+            )
     if not outcome.live:
         return FAILED
-    print(f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
-          f'{offline.PICTURE}, {SUMMARY_FILE}')
+    print(
+        f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
+        f'{offline.PICTURE}, {SUMMARY_FILE}'
+    )
     return 0
 
 
@@ -243,14 +324,24 @@ ODOMETRY = Command(
     'RowTrajectory in Python), tracks.npz (for export), summary.json and a picture; with errors '
     'if the bag contains ground truth of the camera. The parameter imu_position should be '
     'configured. Exit code 1: odometry did not start.',
-    options.declared({
-        **options.of_run('odometry'),
-        '--loops': {
-            'action': 'store_true', 'help': 'add loop closures to the smoothed path: keyframes '
-            'far apart in time with a common view, related as by `rs_relpose pairs`'},
-        '--rate': {
-            'metavar': 'HZ', 'type': rate_in_hertz, 'default': 0.0,
-            'help': 'also write trajectory_rows.tum: smoothed poses at this rate'}}), _odometry)
+    options.declared(
+        {
+            **options.of_run('odometry'),
+            '--loops': {
+                'action': 'store_true',
+                'help': 'add loop closures to the smoothed path: keyframes '
+                'far apart in time with a common view, related as by `rs_relpose pairs`',
+            },
+            '--rate': {
+                'metavar': 'HZ',
+                'type': rate_in_hertz,
+                'default': 0.0,
+                'help': 'also write trajectory_rows.tum: smoothed poses at this rate',
+            },
+        }
+    ),
+    _odometry,
+)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -261,8 +352,10 @@ def _export(args: argparse.Namespace) -> int:
     if args.format == TUM and (args.images or args.link):
         raise InputError('--format tum has no images: leave out --images and --link')
     if args.link and args.trajectory is None:
-        raise InputError('--link needs --trajectory DIR: the images of a bag are no files, so '
-                         'they are kept in DIR/images')
+        raise InputError(
+            '--link needs --trajectory DIR: the images of a bag are no files, so '
+            'they are kept in DIR/images'
+        )
     if args.link and (args.images or FORMATS[args.format].images) != export.RAW:
         raise InputError('--link is for raw images: use --images raw')
     with beside(args.out) as part:
@@ -279,8 +372,15 @@ def _export(args: argparse.Namespace) -> int:
             part.mkdir()
             with options.opened(args, read_parameters(args.params, args.set)) as opened:
                 report = export.export_into(
-                    part, *opened, trajectory, args.format, args.images, args.rate, args.points,
-                    trajectory / IMAGES if args.link else None)
+                    part,
+                    *opened,
+                    trajectory,
+                    args.format,
+                    args.images,
+                    args.rate,
+                    args.points,
+                    trajectory / IMAGES if args.link else None,
+                )
             _print_report(args, report)
             if args.trajectory is None:
                 trajectory.rename(part / 'odometry')
@@ -296,12 +396,16 @@ def _print_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
         print('no points: no track over three keyframes with a pose and enough parallax')
     else:
         reprojection, formula = (
-            'mean {mean:.2f} px, median {median:.2f}, 95 % {most:.2f}, largest {largest:.2f}'
-            .format(**report[name]) for name in ('reprojection_px', 'formula_px'))
+            'mean {mean:.2f} px, median {median:.2f}, 95 % {most:.2f}, largest '
+            '{largest:.2f}'.format(**report[name])
+            for name in ('reprojection_px', 'formula_px')
+        )
         print(f'points in the images, at the poses of their rows: {reprojection}')
         print(f'{args.format} has {FORMATS[args.format].poses}: off that by {formula}')
-    options.warn_unused(dict(Counter(one['reason'] for one in report['left_out']).most_common()),
-                        f'left out (stamps in {export.REPORT_FILE})')
+    options.warn_unused(
+        dict(Counter(one['reason'] for one in report['left_out']).most_common()),
+        f'left out (stamps in {export.REPORT_FILE})',
+    )
     for begin_ns, end_ns in report['trajectory_gaps_ns']:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 
@@ -313,26 +417,50 @@ EXPORT = Command(
     f'a pose are left out and listed in {export.REPORT_FILE}. Prints how far the points are from '
     'their pixels, and how far the interpolation of the format is from the trajectory. The '
     'directory appears when it is complete. Exit code 1: odometry did not start.',
-    options.declared({
-        **options.BAG,
-        'out': {'metavar': 'OUT', 'type': Path, 'help': 'directory to create (tum: the file)'},
-        '--format': {'choices': (TUM, *FORMATS), 'required': True,
-                     'help': 'what reads the result (docs/reconstruction.md)'},
-        '--rate': {
-            'metavar': 'HZ', 'type': rate_in_hertz, 'default': 0.0, 'help': 'images, at most so '
-            'many a second, or poses (tum); default: those of the keyframes, in which points are '
-            'observed'},
-        '--images': {
-            'choices': export.IMAGE_CHOICES, 'default': '', 'help': 'as recorded, derotated to '
-            'their middle row, or none; default: unrolled for colmap, which has one pose per '
-            'image, else raw'},
-        '--trajectory': {
-            'metavar': 'DIR', 'type': Path, 'help': 'results of `rs_relpose odometry` of this '
-            'bag; default: it is run, into OUT/odometry'},
-        '--link': {
-            'action': 'store_true', 'help': 'keep raw images once in DIR/images of --trajectory '
-            'and link them'},
-        '--points': {
-            'metavar': 'N', 'type': int, 'default': export.MOST_POINTS,
-            'help': 'at most so many points, the best ones (default: %(default)s)'},
-        **options.PARAMETERS, **options.TOPICS}), _export)
+    options.declared(
+        {
+            **options.BAG,
+            'out': {'metavar': 'OUT', 'type': Path, 'help': 'directory to create (tum: the file)'},
+            '--format': {
+                'choices': (TUM, *FORMATS),
+                'required': True,
+                'help': 'what reads the result (docs/reconstruction.md)',
+            },
+            '--rate': {
+                'metavar': 'HZ',
+                'type': rate_in_hertz,
+                'default': 0.0,
+                'help': 'images, at most so '
+                'many a second, or poses (tum); default: those of the keyframes, in which points '
+                'are '
+                'observed',
+            },
+            '--images': {
+                'choices': export.IMAGE_CHOICES,
+                'default': '',
+                'help': 'as recorded, derotated to '
+                'their middle row, or none; default: unrolled for colmap, which has one pose per '
+                'image, else raw',
+            },
+            '--trajectory': {
+                'metavar': 'DIR',
+                'type': Path,
+                'help': 'results of `rs_relpose odometry` of this '
+                'bag; default: it is run, into OUT/odometry',
+            },
+            '--link': {
+                'action': 'store_true',
+                'help': 'keep raw images once in DIR/images of --trajectory and link them',
+            },
+            '--points': {
+                'metavar': 'N',
+                'type': int,
+                'default': export.MOST_POINTS,
+                'help': 'at most so many points, the best ones (default: %(default)s)',
+            },
+            **options.PARAMETERS,
+            **options.TOPICS,
+        }
+    ),
+    _export,
+)

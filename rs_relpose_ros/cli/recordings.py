@@ -33,16 +33,24 @@ _logger = logging.getLogger(__name__)
 
 
 def calibrate_bag(
-        args: argparse.Namespace) -> tuple[calibration.CalibrationResult, RollingShutterCamera]:
+    args: argparse.Namespace,
+) -> tuple[calibration.CalibrationResult, RollingShutterCamera]:
     """Calibrate and write the files of the command."""
     try:
         tracking = settings.TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
-        config = replace(settings.TRACKED_IN_IMAGES, max_time_offset=args.max_offset,
-                         exposure_time=args.exposure_time, exposure_margin=args.exposure_margin)
-    except InputError as error:   # names the settings: replaced by the options
+        config = replace(
+            settings.TRACKED_IN_IMAGES,
+            max_time_offset=args.max_offset,
+            exposure_time=args.exposure_time,
+            exposure_margin=args.exposure_margin,
+        )
+    except InputError as error:  # names the settings: replaced by the options
         text = str(error)
-        for name, option in (('feature_rows', '--rows'), ('max_time_offset', '--max-offset'),
-                             ('exposure_', '--exposure-')):
+        for name, option in (
+            ('feature_rows', '--rows'),
+            ('max_time_offset', '--max-offset'),
+            ('exposure_', '--exposure-'),
+        ):
             text = text.replace(name, option)
         raise InputError(text) from None
     folder = options.out_folder(args, 'calibration')
@@ -57,26 +65,41 @@ def calibrate_bag(
         recording = recording.with_unknown_lens(args.lens)
     first, last = args.rows
     if first >= recording.camera.height:
-        raise InputError(f'--rows {first:g} {last:g} leave nothing of an image of '
-                         f'{recording.camera.height} rows: give the first and the last to use')
+        raise InputError(
+            f'--rows {first:g} {last:g} leave nothing of an image of '
+            f'{recording.camera.height} rows: give the first and the last to use'
+        )
     options.warn_unused(recording.unused)
     with options.progress_bar(100, '%', 'fitting') as bar:
         result = recording.calibrated(
-            config, quat_prior=placed and placed[3:],
-            progress=lambda share: bar.update(round(100 * share) - bar.n))
+            config,
+            quat_prior=placed and placed[3:],
+            progress=lambda share: bar.update(round(100 * share) - bar.n),
+        )
     values: dict[str, Any] = {}
     if placed is not None:
         values, contradiction = extrinsics(
-            settings.Parameters.from_mapping({'quat_cam_imu_xyzw': result.quat_cam_imu_xyzw,
-                                              'axes_sigma': min(result.rotation.sigma, 1.0)}),
-            placed, frames.camera, frames.imu)
+            settings.Parameters.from_mapping(
+                {
+                    'quat_cam_imu_xyzw': result.quat_cam_imu_xyzw,
+                    'axes_sigma': min(result.rotation.sigma, 1.0),
+                }
+            ),
+            placed,
+            frames.camera,
+            frames.imu,
+        )
         if contradiction:
             _logger.warning('%s', contradiction)
     prepare_folder(folder, _CALIBRATION_FILES)
     text = calibration.parameter_file(
-        result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
-        camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
-        feature_rows=tuple(args.rows), placed=values)
+        result,
+        f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
+        camera=recording.camera,
+        compressed=topics.image.msgtype == COMPRESSED_IMAGE,
+        feature_rows=tuple(args.rows),
+        placed=values,
+    )
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
     mapping = calibration.as_mapping(result, recording.camera)
     for path, content in ((parameters, text), (metrics, json.dumps(mapping, indent=1) + '\n')):
@@ -102,29 +125,61 @@ CALIBRATE = Command(
     '10 s of a static, textured scene with a short exposure; rotate the camera about all three '
     'axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), calibration.json '
     'and cost_over_readout.png. Exit code 1: a parameter is not observable in this recording and '
-    'left out; the report describes the motion to record instead.', options.declared({
-        **options.BAG, **options.out('calibration'),
-        '--rows': {
-            'metavar': ('FIRST', 'LAST'), 'type': float, 'nargs': 2, 'default': (0.0, 0.0),
-            'help': 'use only these image rows, such as those above a dashboard that moves with '
-            'the camera'},
-        '--detector': {
-            'choices': tuple(settings.TRACKERS), 'default': settings.TrackingConfig().detector,
-            'help': 'tracker that follows the points, as the parameter of the node (default: '
-            '%(default)s)'},
-        '--max-offset': {
-            'metavar': 'S', 'type': float, 'default': settings.CalibrationConfig().max_time_offset,
-            'help': 'bound of the clock offset [s] (default: %(default)s)'},
-        '--lens': {
-            'metavar': 'MODEL', 'choices': tuple(DISTORTION_MODELS), 'nargs': '?',
-            'const': 'plumb_bob', 'help': 'estimate focal length, first coefficient of the '
-            'distortion of this model (default: plumb_bob) and principal point, also if the '
-            'CameraInfo has a camera matrix without distortion'},
-        **{f'--exposure-{name}': {'metavar': 'S', 'type': float, 'default': 0.0,
-                                  'help': f'{text}, if it is known'} for name, text in (
-            ('time', 'exposure of a row [s]'), ('margin', 'frame interval less exposure [s]'))},
-        **{name: options.TOPICS[name] for name in (
-            '--image-topic', '--camera-info-topic', '--imu-topic')}}), _calibrate)
+    'left out; the report describes the motion to record instead.',
+    options.declared(
+        {
+            **options.BAG,
+            **options.out('calibration'),
+            '--rows': {
+                'metavar': ('FIRST', 'LAST'),
+                'type': float,
+                'nargs': 2,
+                'default': (0.0, 0.0),
+                'help': 'use only these image rows, such as those above a dashboard that moves '
+                'with '
+                'the camera',
+            },
+            '--detector': {
+                'choices': tuple(settings.TRACKERS),
+                'default': settings.TrackingConfig().detector,
+                'help': 'tracker that follows the points, as the parameter of the node (default: '
+                '%(default)s)',
+            },
+            '--max-offset': {
+                'metavar': 'S',
+                'type': float,
+                'default': settings.CalibrationConfig().max_time_offset,
+                'help': 'bound of the clock offset [s] (default: %(default)s)',
+            },
+            '--lens': {
+                'metavar': 'MODEL',
+                'choices': tuple(DISTORTION_MODELS),
+                'nargs': '?',
+                'const': 'plumb_bob',
+                'help': 'estimate focal length, first coefficient of the '
+                'distortion of this model (default: plumb_bob) and principal point, also if the '
+                'CameraInfo has a camera matrix without distortion',
+            },
+            **{
+                f'--exposure-{name}': {
+                    'metavar': 'S',
+                    'type': float,
+                    'default': 0.0,
+                    'help': f'{text}, if it is known',
+                }
+                for name, text in (
+                    ('time', 'exposure of a row [s]'),
+                    ('margin', 'frame interval less exposure [s]'),
+                )
+            },
+            **{
+                name: options.TOPICS[name]
+                for name in ('--image-topic', '--camera-info-topic', '--imu-topic')
+            },
+        }
+    ),
+    _calibrate,
+)
 
 
 def inspect_bag(args: argparse.Namespace) -> CheckReport:
@@ -134,7 +189,7 @@ def inspect_bag(args: argparse.Namespace) -> CheckReport:
         chosen = bag.choose_topics(options.topic_options(args))
         messages = sum(topic.count for topic in filter(None, chosen))
         if parameters.sensor.missing() and chosen.image is not None:
-            messages *= 2   # the bag is read twice
+            messages *= 2  # the bag is read twice
         with options.progress_bar(messages, 'message', options.bag_name(args.bag)) as bar:
             bag.on_message = lambda _: bar.update()
             return check_bag(bag, chosen, parameters)
@@ -156,42 +211,60 @@ CHECK = Command(
     'stamps, clocks, encodings, transport; and, by a test run of half a minute of it, axes, time '
     'offset, readout time, bias, units, focal length and lens. Prints a line for each, with a '
     'verdict (ok, unknown, warning, failure) and the suggested fix. Exit code 1: a defect makes '
-    'the estimation fail or its poses wrong.', options.declared({
-        **options.BAG, **options.PARAMETERS,
-        '--json': {'action': 'store_true', 'help': 'print the report as JSON'},
-        **options.SENSOR_TOPICS}), _check)
+    'the estimation fail or its poses wrong.',
+    options.declared(
+        {
+            **options.BAG,
+            **options.PARAMETERS,
+            '--json': {'action': 'store_true', 'help': 'print the report as JSON'},
+            **options.SENSOR_TOPICS,
+        }
+    ),
+    _check,
+)
 
 
 class Source(NamedTuple):
     """A format of recordings."""
 
     help: str
-    path: str   # 'FILE' or 'FOLDER'
-    read: Callable[[Path, Path | None], Recording]   # path, lens profile
+    path: str  # 'FILE' or 'FOLDER'
+    read: Callable[[Path, Path | None], Recording]  # path, lens profile
     has_lens_profile: bool = False
 
 
 def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
     """A reader of another package, found by name: the product does not depend on it."""
-    return lambda folder, _: getattr(library(
-        'rs_relpose_lab.datasets', f'public recordings need {LABORATORY}'), reader)(folder)
+    return lambda folder, _: getattr(
+        library('rs_relpose_lab.datasets', f'public recordings need {LABORATORY}'), reader
+    )(folder)
 
 
 SOURCES: Mapping[str, Source] = {
     'video': Source(
         'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
         '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
-        'FILE', recorders.read_video, has_lens_profile=True),
+        'FILE',
+        recorders.read_video,
+        has_lens_profile=True,
+    ),
     'android': Source(
         f"folder of a phone's logger, recognised by its files: {recorders.known_loggers()}",
-        'FOLDER', lambda folder, _: recorders.read_android(folder)),
+        'FOLDER',
+        lambda folder, _: recorders.read_android(folder),
+    ),
     'realsense_rgb_rs': Source(
         'colour camera, gyro and accelerometer of a RealSense, from '
         'github.com/Zoltan3057/DM-VIO-dataset (imu.txt, frames.csv, camera.txt, images/)',
-        'FOLDER', _of_laboratory('read_realsense')),
+        'FOLDER',
+        _of_laboratory('read_realsense'),
+    ),
     'xiaomi_cc9_rs': Source(
         'phone with gyro, from github.com/lhaippp/gyro-video-stabilization '
-        '(gyro.txt, framestamp.txt, images/)', 'FOLDER', _of_laboratory('read_xiaomi')),
+        '(gyro.txt, framestamp.txt, images/)',
+        'FOLDER',
+        _of_laboratory('read_xiaomi'),
+    ),
 }
 
 
@@ -200,14 +273,21 @@ def _add_convert_arguments(parser: argparse.ArgumentParser) -> None:
     for name, source in SOURCES.items():
         one = sources.add_parser(name, help=source.help, description=source.help)
         one.add_argument('path', metavar=source.path, type=Path, help='the recording')
-        one.add_argument('out_bag', metavar='OUT_BAG', type=Path,
-                         help='bag directory to create; OUT_BAG.yaml is written next to it')
+        one.add_argument(
+            'out_bag',
+            metavar='OUT_BAG',
+            type=Path,
+            help='bag directory to create; OUT_BAG.yaml is written next to it',
+        )
         if source.has_lens_profile:
             one.add_argument(
-                '--lens-profile', metavar='PATH', type=Path,
+                '--lens-profile',
+                metavar='PATH',
+                type=Path,
                 help="Gyroflow's profile of the camera's mode (JSON), or a folder of them, such "
                 'as a checkout of github.com/gyroflow/lens_profiles: calibration of the lens, and '
-                'an initial value of the readout time if the file does not contain it')
+                'an initial value of the readout time if the file does not contain it',
+            )
         one.set_defaults(lens_profile=None)
 
 
@@ -224,9 +304,11 @@ def _convert(args: argparse.Namespace) -> int:
     write_parameters(parameters, recording.title, recording.parameters)
     size = sum(file.stat().st_size for file in args.out_bag.iterdir())
     samples = len(recording.cropped(recording.imu)) + len(recording.cropped(recording.accel))
-    print(f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples'
-          + (f', {len(recording.truth)} true poses' if recording.truth else '')
-          + f', {size / 1e6:.1f} MB; parameters of the node: {parameters}')
+    print(
+        f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples'
+        + (f', {len(recording.truth)} true poses' if recording.truth else '')
+        + f', {size / 1e6:.1f} MB; parameters of the node: {parameters}'
+    )
     if 'readout_time' not in {value.name for value in recording.parameters}:
         print(f'the readout time is unknown: rs_relpose calibrate {args.out_bag}')
     return 0
@@ -238,7 +320,10 @@ CONVERT = Command(
     '/camera/camera_info if the camera is calibrated, and /ground_truth/pose if the recording '
     'contains poses; and write OUT_BAG.yaml next to it: the parameters of relpose_node, each with '
     'its source. Stamps and JPEG images are copied unchanged. "rs_relpose convert SOURCE --help" '
-    'describes a source.', _add_convert_arguments, _convert)
+    'describes a source.',
+    _add_convert_arguments,
+    _convert,
+)
 
 
 def _unroll(args: argparse.Namespace) -> int:
@@ -251,8 +336,9 @@ def _unroll(args: argparse.Namespace) -> int:
         _logger.warning('%s', line)
     options.warn_unused(report.reasons.most_common(), 'omitted')
     omitted = report.images_in_bag - report.images
-    text = (f'{report.images} of {report.images_in_bag} images derotated'
-            + (f', {omitted} omitted' if omitted else ''))
+    text = f'{report.images} of {report.images_in_bag} images derotated' + (
+        f', {omitted} omitted' if omitted else ''
+    )
     if not report.images:
         print(f'{text}; nothing was written')
         return FAILED
@@ -268,9 +354,19 @@ UNROLL = Command(
     "CameraInfo on the same topics, stamped with the time of the middle row on the IMU's clock "
     "(the time offset between camera and IMU is then 0), or on the camera's if the parameter "
     'stamp_clock is camera. All other topics are copied bit by bit. Images that the gyro does not '
-    'cover are omitted. Exit code 1: no image could be derotated.', options.declared({
-        **options.BAG,
-        'out_bag': {
-            'metavar': 'OUT_BAG', 'type': Path, 'help': 'directory of the new bag; it must not '
-            'exist, and appears when the bag is complete'},
-        **options.PARAMETERS, **options.SENSOR_TOPICS}), _unroll)
+    'cover are omitted. Exit code 1: no image could be derotated.',
+    options.declared(
+        {
+            **options.BAG,
+            'out_bag': {
+                'metavar': 'OUT_BAG',
+                'type': Path,
+                'help': 'directory of the new bag; it must not '
+                'exist, and appears when the bag is complete',
+            },
+            **options.PARAMETERS,
+            **options.SENSOR_TOPICS,
+        }
+    ),
+    _unroll,
+)

@@ -27,9 +27,12 @@ _NODE = 'relpose_node'
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
 # Sigma of each parameter of a calibration. A file that has one of them is a calibration file.
 _SIGMAS = {
-    'readout_time': 'readout_time_sigma', 'time_offset': 'time_offset_sigma',
+    'readout_time': 'readout_time_sigma',
+    'time_offset': 'time_offset_sigma',
     'time_offset_per_interval': 'time_offset_per_interval_sigma',
-    'quat_cam_imu_xyzw': 'axes_sigma', 'camera_matrix': 'focal_length_sigma'}
+    'quat_cam_imu_xyzw': 'axes_sigma',
+    'camera_matrix': 'focal_length_sigma',
+}
 # Largest file that is read [bytes]; a file of all parameters has 10,000.
 _MAX_BYTES = 1 << 20
 _COMMENT_WIDTH = 95
@@ -44,8 +47,9 @@ class SourcedValue:
     source: str
 
 
-def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
-                    node: str = _NODE) -> Parameters:
+def read_parameters(
+    path: Path | str | None, assignments: Sequence[str] = (), node: str = _NODE
+) -> Parameters:
     """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
 
     The file is one for ``ros2 run --params-file`` of `node`; the values of assignments are YAML,
@@ -61,9 +65,11 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
             if any(values.get(sigma) for sigma in _SIGMAS.values()):
                 for name, sigma in _SIGMAS.items():
                     if name in values and sigma not in values:
-                        raise InputError(f'{name} is given without {sigma}: a calibration file '
-                                         'has each parameter with its sigma, 0 if that is not '
-                                         'known')
+                        raise InputError(
+                            f'{name} is given without {sigma}: a calibration file '
+                            'has each parameter with its sigma, 0 if that is not '
+                            'known'
+                        )
             parameters = parameters.updated(values)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
@@ -95,9 +101,14 @@ def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> 
 
 def comment(text: str, indent: str = '') -> list[str]:
     """Lines of a comment; none for an empty text."""
-    return textwrap.wrap(text, _COMMENT_WIDTH, initial_indent=f'{indent}# ',
-                         subsequent_indent=f'{indent}# ', break_long_words=False,
-                         break_on_hyphens=False)
+    return textwrap.wrap(
+        text,
+        _COMMENT_WIDTH,
+        initial_indent=f'{indent}# ',
+        subsequent_indent=f'{indent}# ',
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def yaml_text(value: Any) -> str:
@@ -129,28 +140,37 @@ def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
     except (yaml.YAMLError, RecursionError) as error:
         raise InputError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict):
-        raise InputError(f'{path} is not a ROS parameter file: it must begin with "/**:" and '
-                         '"ros__parameters:"')
+        raise InputError(
+            f'{path} is not a ROS parameter file: it must begin with "/**:" and "ros__parameters:"'
+        )
     values: dict[str, Any] = {}
     for node in document:
         if node in ('/**', wanted) or str(node).endswith(f'/{wanted}'):
             section = document[node]
             inner = section.get('ros__parameters') if isinstance(section, dict) else None
             if not isinstance(inner, dict):
-                raise InputError(f'{path}: {node!r} must have a section "ros__parameters:" with '
-                                 'names and values')
-            values |= {str(name): value for name, value in inner.items()
-                       if name not in _ROS_OWN and not str(name).startswith('qos_overrides')}
+                raise InputError(
+                    f'{path}: {node!r} must have a section "ros__parameters:" with '
+                    'names and values'
+                )
+            values |= {
+                str(name): value
+                for name, value in inner.items()
+                if name not in _ROS_OWN and not str(name).startswith('qos_overrides')
+            }
     if not values:
-        raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
-                         f'"{wanted}:" and "ros__parameters:"')
+        raise InputError(
+            f'{path} has no parameters of {wanted}: they must be below "/**:" or '
+            f'"{wanted}:" and "ros__parameters:"'
+        )
     return _converted(values)
 
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
     """Lists to tuples, and 1e-5 to a number, as in ROS (a text in PyYAML)."""
-    numbers = {name for name, _, declared in Parameters.declarations()
-               if declared.kind in (float, tuple)}
+    numbers = {
+        name for name, _, declared in Parameters.declarations() if declared.kind in (float, tuple)
+    }
 
     def converted(name: str, value: Any) -> Any:
         if isinstance(value, list):
@@ -182,8 +202,11 @@ def parameter_template() -> str:
         meaning = declared.description
         if declared.legal not in ('finite', *ANY_VALUE.values()):
             meaning += f': {declared.legal}'
-        lines += ['', *comment(meaning + ' [live]' * declared.live, '    '),
-                  f'    # {name}:' if default is None else f'    {name}: {yaml_text(default)}']
+        lines += [
+            '',
+            *comment(meaning + ' [live]' * declared.live, '    '),
+            f'    # {name}:' if default is None else f'    {name}: {yaml_text(default)}',
+        ]
     return _HEAD + '\n'.join(lines[1:]) + '\n'
 
 

@@ -78,17 +78,30 @@ _GAUSSIAN = 1.109
 class Tracks(NamedTuple):
     """Observations of N tracks in V frames, in blocks; those not used are zero."""
 
-    observations: Array   # (V, blocks, VALUES, BLOCK)
-    used: Flags   # (V, blocks, BLOCK)
-    rotations: Array   # (V, 3, 3) R_v by the gyro
-    duration: float   # T [s]
-    number: int   # N
+    observations: Array  # (V, blocks, VALUES, BLOCK)
+    used: Flags  # (V, blocks, BLOCK)
+    rotations: Array  # (V, 3, 3) R_v by the gyro
+    duration: float  # T [s]
+    number: int  # N
 
 
 @kernel
-def fill_view(tracks: Tracks, v: int, used: Flags, rays: Array, jacobian: Array, times: Array,
-              rotations: Array, row_rotation: Array, interval: float, alpha: Array, beta: Array,
-              acceleration: Array, arm: Array, chord: Array) -> None:
+def fill_view(
+    tracks: Tracks,
+    v: int,
+    used: Flags,
+    rays: Array,
+    jacobian: Array,
+    times: Array,
+    rotations: Array,
+    row_rotation: Array,
+    interval: float,
+    alpha: Array,
+    beta: Array,
+    acceleration: Array,
+    arm: Array,
+    chord: Array,
+) -> None:
     """Fill the observations of view v: derotated rays, and the displacement by the IMU.
 
     `rotations` (N, 3, 3) of the rows, `row_rotation` (3,) from one row to the next [rad].
@@ -119,29 +132,35 @@ def fill_view(tracks: Tracks, v: int, used: Flags, rays: Array, jacobian: Array,
             o[RAY + x, k] = ray[x]
             o[TO_PIXELS + x, k] = (vv * J[x, 0] - uv * J[x, 1]) / determinant
             o[TO_PIXELS + 3 + x, k] = (uu * J[x, 1] - uv * J[x, 0]) / determinant
-            o[MOVED + x, k] = (alpha[x] + tau * beta[x] + 0.5 * tau * tau * acceleration[x]
-                               - turned[x] + arm[x] - time / tracks.duration * chord[x])
+            o[MOVED + x, k] = (
+                alpha[x]
+                + tau * beta[x]
+                + 0.5 * tau * tau * acceleration[x]
+                - turned[x]
+                + arm[x]
+                - time / tracks.duration * chord[x]
+            )
 
 
 class PathPriors(NamedTuple):
     """Gaussian priors; weights are inverse variances. Those of e and b have zero mean."""
 
-    log_scale: float   # mean of log k
+    log_scale: float  # mean of log k
     log_scale_weight: float
     bias_weight: float
-    acceleration_weights: Array   # (K,) of e_0, e_1, ...
-    rotation_information: Array   # (3 V - 3, 3 V - 3) of phi_1, phi_2, ...
+    acceleration_weights: Array  # (K,) of e_0, e_1, ...
+    rotation_information: Array  # (3 V - 3, 3 V - 3) of phi_1, phi_2, ...
 
 
 class PathState(NamedTuple):
     """The unknowns."""
 
-    t: Array   # (3,) unit
-    log_scale: float   # log k
-    bias: Array   # (3,) b
-    accelerations: Array   # (K, 3) e
-    rotations: Array   # (V, 3) phi
-    tracks: Array   # (blocks, TRACK_VALUES, BLOCK)
+    t: Array  # (3,) unit
+    log_scale: float  # log k
+    bias: Array  # (3,) b
+    accelerations: Array  # (K, 3) e
+    rotations: Array  # (V, 3) phi
+    tracks: Array  # (blocks, TRACK_VALUES, BLOCK)
 
 
 @kernel
@@ -155,21 +174,30 @@ def start_of_tracks(tracks: Tracks, R: Array, t: Array) -> Array:
     for b in range(len(first)):
         for i in range(BLOCK):
             x, y, z = first[b, RAY, i], first[b, RAY + 1, i], first[b, RAY + 2, i]
-            if not tracks.used[0, b, i]:   # no observation of it counts
+            if not tracks.used[0, b, i]:  # no observation of it counts
                 z = 1.0
             sign = math.copysign(1.0, z)
             a = -1.0 / (sign + z)
             track, f = out[b], (x, y, z)
             for k in range(3):
                 track[DIRECTION + k, i] = f[k]
-            columns = (1.0 + sign * x * x * a, sign * x * y * a, -sign * x, x * y * a,
-                       sign + y * y * a, -y)
+            columns = (
+                1.0 + sign * x * x * a,
+                sign * x * y * a,
+                -sign * x,
+                x * y * a,
+                sign + y * y * a,
+                -y,
+            )
             for k in range(6):
                 track[COLUMNS + k, i] = columns[k]
             h = rotated(R, (last[b, RAY, i], last[b, RAY + 1, i], last[b, RAY + 2, i]))
             normal = cross(f, h)
-            squared, by_h, by_f = (dot(normal, normal), dot(cross(t, h), normal),
-                                   dot(cross(t, f), normal))
+            squared, by_h, by_f = (
+                dot(normal, normal),
+                dot(cross(t, h), normal),
+                dot(cross(t, f), normal),
+            )
             usable = squared > _PARALLEL and by_h > 0.0 and by_f > 0.0
             track[INVERSE_DISTANCE, i] = squared / by_h if usable else _FAR
     return out
@@ -199,20 +227,34 @@ class Adjusted(NamedTuple):
     state: PathState
     sigma: float
     covariance: Array
-    far: Flags   # (V, blocks, BLOCK) observations far from their predictions
+    far: Flags  # (V, blocks, BLOCK) observations far from their predictions
 
 
 @small_kernel
 def _bends(s: float, T: float) -> tuple[float, float, float]:
     """``B_j(s)`` of the polynomials 1, 2 x - 1 and 6 x^2 - 6 x + 1 of ``x = s / T``."""
     x = s / T
-    return (0.5 * T * T * (x * x - x), T * T * x * (x * x / 3.0 - 0.5 * x + 1.0 / 6.0),
-            0.5 * T * T * x * x * (x * x - 2.0 * x + 1.0))
+    return (
+        0.5 * T * T * (x * x - x),
+        T * T * x * (x * x / 3.0 - 0.5 * x + 1.0 / 6.0),
+        0.5 * T * T * x * x * (x * x - 2.0 * x + 1.0),
+    )
 
 
 @small_kernel
-def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: float, T: float,
-             variance: float, moves: float, rows: Array, squares: Array) -> None:
+def _observe(
+    o: Array,
+    track: Array,
+    R: Array,
+    basis: Array,
+    motion: Array,
+    k: float,
+    T: float,
+    variance: float,
+    moves: float,
+    rows: Array,
+    squares: Array,
+) -> None:
     """Derivatives (_ROWS, 2, BLOCK) of a block's observations, times the roots of their weights.
 
     `o`, `track`: blocks of `Tracks` and of `PathState`; R of the frame; `motion` (5, 3): t, bias
@@ -224,12 +266,21 @@ def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: f
         moved = (o[MOVED, i], o[MOVED + 1, i], o[MOVED + 2, i])
         for j in range(MOST_ACCELERATIONS):
             e = 2 + j
-            moved = (moved[0] + bends[j] * motion[e, 0], moved[1] + bends[j] * motion[e, 1],
-                     moved[2] + bends[j] * motion[e, 2])
-        path = (share * motion[0, 0] + k * moved[0], share * motion[0, 1] + k * moved[1],
-                share * motion[0, 2] + k * moved[2])
-        before = (track[0, i] - rho * path[0], track[1, i] - rho * path[1],
-                  track[2, i] - rho * path[2])
+            moved = (
+                moved[0] + bends[j] * motion[e, 0],
+                moved[1] + bends[j] * motion[e, 1],
+                moved[2] + bends[j] * motion[e, 2],
+            )
+        path = (
+            share * motion[0, 0] + k * moved[0],
+            share * motion[0, 1] + k * moved[1],
+            share * motion[0, 2] + k * moved[2],
+        )
+        before = (
+            track[0, i] - rho * path[0],
+            track[1, i] - rho * path[1],
+            track[2, i] - rho * path[2],
+        )
         # Exp(s b) to first order: b is that of a calibrated gyro.
         turn = cross(motion[1], before)
         away = (before[0] - s * turn[0], before[1] - s * turn[1], before[2] - s * turn[2])
@@ -248,8 +299,14 @@ def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: f
             a, b, c = TO_PIXELS + 3 * m, TO_PIXELS + 3 * m + 1, TO_PIXELS + 3 * m + 2
             along, size = o[a, i] * ray[0] + o[b, i] * ray[1] + o[c, i] * ray[2], root * scale
             # Derivative by `away`, in the axes of camera 1.
-            u = rotated(R, (size * (o[a, i] - along * ray[0]), size * (o[b, i] - along * ray[1]),
-                            size * (o[c, i] - along * ray[2])))
+            u = rotated(
+                R,
+                (
+                    size * (o[a, i] - along * ray[0]),
+                    size * (o[b, i] - along * ray[1]),
+                    size * (o[c, i] - along * ray[2]),
+                ),
+            )
             by_path, turned = (-rho * u[0], -rho * u[1], -rho * u[2]), cross(u, away)
             rows[2, m, i] = -dot(u, path)
             rows[_PATH + LOG_SCALE, m, i] = k * dot(by_path, moved)
@@ -257,7 +314,8 @@ def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: f
                 a, b, c = COLUMNS + 3 * x, COLUMNS + 3 * x + 1, COLUMNS + 3 * x + 2
                 rows[x, m, i] = u[0] * track[a, i] + u[1] * track[b, i] + u[2] * track[c, i]
                 rows[_PATH + x, m, i] = share * (
-                    by_path[0] * basis[0, x] + by_path[1] * basis[1, x] + by_path[2] * basis[2, x])
+                    by_path[0] * basis[0, x] + by_path[1] * basis[1, x] + by_path[2] * basis[2, x]
+                )
             for x in range(3):
                 rows[_PHI + x, m, i] = moves * turned[x]
                 rows[_PATH + BIAS + x, m, i] = s * turned[x]
@@ -266,15 +324,16 @@ def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: f
 
 
 @small_kernel
-def _accumulate(rows: Array, places: NDArray[np.int64], gram: Array, own: Array, mixed: Array,
-                whole: Array) -> None:
+def _accumulate(
+    rows: Array, places: NDArray[np.int64], gram: Array, own: Array, mixed: Array, whole: Array
+) -> None:
     """Add a block of one frame to the equations.
 
     Of its tracks: `own` (6, BLOCK) lower triangles; `mixed` (n + 1, 4, BLOCK) products of the
     unknowns `places` (M,) of `rows`, from the residual on, with those of the track and with the
     residual. `whole` (n + 1, n + 1): of the path, with `gram` (M, M) as room.
     """
-    used = rows.reshape(_ROWS, 2 * BLOCK)[_RESIDUAL:_RESIDUAL + len(places)]
+    used = rows.reshape(_ROWS, 2 * BLOCK)[_RESIDUAL : _RESIDUAL + len(places)]
     np.dot(used, used.T, gram)
     for y in range(len(places)):
         for x in range(len(places)):
@@ -315,8 +374,9 @@ def _eliminate(own: Array, rho: Array, mixed: Array, factors: Array, solved: Arr
             second = (of[1, i] - factors[1, i] * first) * factors[2, i]
             third = (of[2, i] - factors[3, i] * first - factors[4, i] * second) * factors[5, i]
             out[0, i], out[1, i], out[2, i] = first, second, third
-            of[3, i] -= (first * solved[n, 0, i] + second * solved[n, 1, i]
-                         + third * solved[n, 2, i])
+            of[3, i] -= (
+                first * solved[n, 0, i] + second * solved[n, 1, i] + third * solved[n, 2, i]
+            )
 
 
 @kernel
@@ -329,7 +389,7 @@ def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: 
     for x in range(3):
         hessian[BIAS + x, BIAS + x] += priors.bias_weight
         gradient[BIAS + x] += priors.bias_weight * state.bias[x]
-        cost += priors.bias_weight * state.bias[x]**2
+        cost += priors.bias_weight * state.bias[x] ** 2
     first = ACCELERATION
     for j in range(len(state.accelerations)):
         for x in range(3):
@@ -348,7 +408,7 @@ def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: 
         cost += product * phi[y]
     for b in range(len(state.tracks)):
         for i in range(BLOCK):
-            cost += (state.tracks[b, INVERSE_DISTANCE, i] / _INVERSE_DISTANCE_SIGMA)**2
+            cost += (state.tracks[b, INVERSE_DISTANCE, i] / _INVERSE_DISTANCE_SIGMA) ** 2
     return cost
 
 
@@ -376,8 +436,19 @@ def linearised(tracks: Tracks, priors: PathPriors, state: PathState, sigma: floa
     for b in range(blocks):
         own, mixed = np.zeros((6, BLOCK)), np.zeros((n + 1, 4, BLOCK))
         for v in range(V):
-            _observe(tracks.observations[v, b], state.tracks[b], rotations[v], basis, motion, k,
-                     tracks.duration, sigma * sigma, min(v, 1), rows, squares[v, b])
+            _observe(
+                tracks.observations[v, b],
+                state.tracks[b],
+                rotations[v],
+                basis,
+                motion,
+                k,
+                tracks.duration,
+                sigma * sigma,
+                min(v, 1),
+                rows,
+                squares[v, b],
+            )
             for x in range(3):
                 places[_PHI - _RESIDUAL + x] = path + 3 * max(v - 1, 0) + x
             _accumulate(rows, places, gram, own, mixed, whole)
@@ -460,8 +531,9 @@ def _step(normal: Normal, damping: float) -> Array:
 
 
 @kernel
-def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float,
-           weight: float) -> Adjusted:
+def adjust(
+    tracks: Tracks, priors: PathPriors, start: PathState, expected: float, weight: float
+) -> Adjusted:
     """Levenberg-Marquardt over path and tracks, the noise estimated again after each step.
 
     `expected` [px]: noise, which counts as much as `weight` degrees of freedom.
@@ -473,26 +545,31 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
     for _ in range(_STEPS):
         # Residuals of fewer degrees of freedom than observations, weighted as in the cost.
         variance = sigma * sigma * _cost(normal, tracks, sigma)[1] / _GAUSSIAN
-        noise = math.sqrt((weight * expected * expected + observations * variance)
-                          / (weight + freedom))
+        noise = math.sqrt(
+            (weight * expected * expected + observations * variance) / (weight + freedom)
+        )
         sigma = math.hypot(noise, _COMMON_SIGMA)
         after = moved_state(state, normal, _step(normal, damping))
         new = linearised(tracks, priors, after, sigma)
         gain = _cost(normal, tracks, sigma)[0] - _cost(new, tracks, sigma)[0]
-        if gain > 0.0:   # False for NaN
+        if gain > 0.0:  # False for NaN
             state, normal, damping = after, new, 0.1 * damping
             if gain < _CONVERGED:
                 break
         else:
             damping = max(100.0 * damping, 1e-4)
     return Adjusted(
-        state, noise, _covariance(normal, state, priors, (sigma / noise)**2, tracks.number),
-        normal.squares > (_FARTHEST * sigma)**2)
+        state,
+        noise,
+        _covariance(normal, state, priors, (sigma / noise) ** 2, tracks.number),
+        normal.squares > (_FARTHEST * sigma) ** 2,
+    )
 
 
 @kernel
-def _covariance(normal: Normal, state: PathState, priors: PathPriors, common: float,
-                count: int) -> Array:
+def _covariance(
+    normal: Normal, state: PathState, priors: PathPriors, common: float, count: int
+) -> Array:
     """Of the path (n, n), with the scatter of the tracks' gradients (sandwich), times `common`.
 
     The errors of one track in consecutive frames are similar, those of the `count` tracks are not.

@@ -33,8 +33,15 @@ LEAST_DISAGREEMENT = 1e-3
 
 
 @small_kernel
-def sandwich(matches: FitMatches, state: TwoViewState, data_hessian: Array, hessian: Array,
-             covariance: Array, prior: Priors, gyro_error: Array) -> Array:
+def sandwich(
+    matches: FitMatches,
+    state: TwoViewState,
+    data_hessian: Array,
+    hessian: Array,
+    covariance: Array,
+    prior: Priors,
+    gyro_error: Array,
+) -> Array:
     """``H^-1 S H^-1`` (n, n) at an optimum `state` with the Hessian H, `covariance` being H^-1.
 
     `data_hessian` (n, n) is the matches' part of H. S is the sum of their covariance, of the
@@ -66,7 +73,7 @@ def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
     if not (cholesky(before, L_before) and cholesky(after, L_after)):
         return covariance
     for i in range(n):
-        for j in range(i, -1, -1):   # T L_before = L_after
+        for j in range(i, -1, -1):  # T L_before = L_after
             value = L_after[i, j]
             for k in range(j + 1, i + 1):
                 value -= T[i, k] * L_before[k, j]
@@ -75,8 +82,9 @@ def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
 
 
 @kernel
-def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
-                     hessian: Array) -> Array:
+def score_of_matches(
+    matches: FitMatches, state: TwoViewState, data_hessian: Array, hessian: Array
+) -> Array:
     """Covariance of the matches' gradient, by image regions g and by the Hessian.
 
     By regions, from their gradients s_g and Hessians H_g::
@@ -99,7 +107,8 @@ def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Arr
             continue
         filled += 1
         own, gradient, squares = sampson.normal_equations(
-            matches.observations, use * matches.weights, state)
+            matches.observations, use * matches.weights, state
+        )
         cost += weight * squares
         so3.copy_matrix(hessian, rest)
         for i in range(PARAMETERS):
@@ -154,8 +163,9 @@ def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -
     chi2, freedom = 0.0, 0.0
     if prior.rotation_information[0, 0] > 0.0:
         theta = so3.log_so3(state.R @ prior.rotation.T)
-        away = ((1.0 + LEAST_DISAGREEMENT) * priors.inverse(prior.rotation_information)
-                - covariance[:3, :3])
+        away = (1.0 + LEAST_DISAGREEMENT) * priors.inverse(
+            prior.rotation_information
+        ) - covariance[:3, :3]
         chi2 += (theta * (priors.inverse(away) @ theta)).sum()
         freedom += 3.0
     chi2 += prior.rate_weight * ((state.dw1**2).sum() + (state.dw2**2).sum())
@@ -174,8 +184,9 @@ def local_covariance(matches: FitMatches, state: TwoViewState, prior: Priors) ->
     return np.asarray(local + np.outer(step, step))
 
 
-def pair_state(problem: TwoViewProblem, state: TwoViewState, log_scale: float,
-               local: Array) -> PairState:
+def pair_state(
+    problem: TwoViewProblem, state: TwoViewState, log_scale: float, local: Array
+) -> PairState:
     """The state in each camera's own frame, with its covariance.
 
     `log_scale`: of the velocities, the logarithm of the baseline if that is in metres. `local`
@@ -195,8 +206,16 @@ def pair_state(problem: TwoViewProblem, state: TwoViewState, log_scale: float,
         jacobian[18, SCALE] = 1.0
     w1 = problem.motion1.angular_velocity + state.dw1
     w2 = problem.motion2.angular_velocity + state.R.T @ state.dw2
-    return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2, log_scale,
-                     jacobian @ local @ jacobian.T)
+    return PairState(
+        state.R,
+        state.t,
+        state.d1,
+        state.R.T @ state.d2,
+        w1,
+        w2,
+        log_scale,
+        jacobian @ local @ jacobian.T,
+    )
 
 
 # -- Information of the images alone, in canonical form: without the priors of the IMU ------------
@@ -226,12 +245,12 @@ class ImageInformation:
     with which the direction hardly depends on the velocities.
     """
 
-    row_time: float   # [s] of the middle row, after the stamped one
-    R: Array   # (3, 3) R_1^T R_2
-    t: Array   # (3,) unit direction; NaN of a rotation alone
-    velocities: Array   # (6,) d_1, d_2, in camera 1; NaN likewise
-    information: Array   # (11, 11), (5, 5) or (3, 3) H
-    gradient: Array   # (11,), (5,) or (3,) g
+    row_time: float  # [s] of the middle row, after the stamped one
+    R: Array  # (3, 3) R_1^T R_2
+    t: Array  # (3,) unit direction; NaN of a rotation alone
+    velocities: Array  # (6,) d_1, d_2, in camera 1; NaN likewise
+    information: Array  # (11, 11), (5, 5) or (3, 3) H
+    gradient: Array  # (11,), (5,) or (3,) g
 
     def of_rotation(self) -> ImageInformation:
         """The same of the rotation alone, the rest eliminated."""
@@ -246,8 +265,9 @@ class ImageInformation:
 
     def enlarged(self, factor: float) -> ImageInformation:
         """The same with its covariance times a factor."""
-        return replace(self, information=self.information / factor,
-                       gradient=self.gradient / factor)
+        return replace(
+            self, information=self.information / factor, gradient=self.gradient / factor
+        )
 
     def _reduced(self, k: int) -> ImageInformation:
         """Of the first k deviations."""
@@ -257,16 +277,17 @@ class ImageInformation:
         rest = np.linalg.pinv(H[k:, k:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
         gain = H[:k, k:] @ (rest * np.outer(scale, scale))
         reduced = H[:k, :k] - gain @ H[k:, :k]
-        return replace(self, information=0.5 * (reduced + reduced.T),
-                       gradient=g[:k] - gain @ g[k:])
+        return replace(
+            self, information=0.5 * (reduced + reduced.T), gradient=g[:k] - gain @ g[k:]
+        )
 
 
-def image_information(matches: FitMatches, state: TwoViewState, prior: Priors,
-                      row_time: float) -> ImageInformation:
+def image_information(
+    matches: FitMatches, state: TwoViewState, prior: Priors, row_time: float
+) -> ImageInformation:
     """Of the matches of a fit, with the rates' part of its `prior` only."""
     H, g = _of_pose(matches, state, prior)
-    return ImageInformation(row_time, state.R, state.t, np.concatenate([state.d1, state.d2]),
-                            H, g)
+    return ImageInformation(row_time, state.R, state.t, np.concatenate([state.d1, state.d2]), H, g)
 
 
 @kernel
@@ -292,8 +313,10 @@ def _of_pose(matches: FitMatches, state: TwoViewState, prior: Priors) -> tuple[A
     return 0.5 * (reduced + reduced.T), g[:POSE] - gain @ g[POSE:]
 
 
-def rotation_information(R: Array, information: Array, prior: Array, theta: Array,
-                         row_time: float) -> ImageInformation:
+def rotation_information(
+    R: Array, information: Array, prior: Array, theta: Array, row_time: float
+) -> ImageInformation:
     """Of a fit of a rotation alone with a `prior` (3, 3) at the distance `theta` (3,)."""
-    return ImageInformation(row_time, R, np.full(3, np.nan), np.full(6, np.nan),
-                            information - prior, -(prior @ theta))
+    return ImageInformation(
+        row_time, R, np.full(3, np.nan), np.full(6, np.nan), information - prior, -(prior @ theta)
+    )

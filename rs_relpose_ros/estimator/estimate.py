@@ -33,15 +33,26 @@ from rs_relpose_ros.solvers.common import Solutions
 
 # -- Arguments of `estimate_relative_pose`: each error names the argument -------------------------
 
-def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None,
-                     ) -> tuple[Array, Array, NDArray[np.int64]]:
+
+def _checked_matches(
+    points1: ArrayLike,
+    points2: ArrayLike,
+    quality: ArrayLike | None,
+) -> tuple[Array, Array, NDArray[np.int64]]:
     """Pixels (N, 2) of both frames, and the sampling order of the matches."""
     count: int | str = 'N'
     checked = []
     for name, value in (('points1', points1), ('points2', points2)):
         empty = value.size == 0 if isinstance(value, np.ndarray) else value in ([], ())
-        checked.append(validate.array(name, np.empty((0, 2)) if empty else value, (count, 2),
-                                      largest=frames_between.LARGEST_PIXEL, unit='px'))
+        checked.append(
+            validate.array(
+                name,
+                np.empty((0, 2)) if empty else value,
+                (count, 2),
+                largest=frames_between.LARGEST_PIXEL,
+                unit='px',
+            )
+        )
         count = len(checked[0])
     if quality is None:
         return checked[0], checked[1], np.arange(count)
@@ -56,18 +67,23 @@ def _checked_interval(interval: float | None, inertial: InertialMotion | None) -
     if inertial is None:
         return interval
     if interval is not None and not math.isclose(interval, inertial.duration, abs_tol=1e-6):
-        raise InputError('interval must equal the duration of inertial, '
-                         f'got {interval:.9g} and {inertial.duration:.9g} s')
+        raise InputError(
+            'interval must equal the duration of inertial, '
+            f'got {interval:.9g} and {inertial.duration:.9g} s'
+        )
     return inertial.duration
 
 
-def _checked_mode(config: EstimatorConfig, motion1: FrameMotion,
-                  motion2: FrameMotion) -> sampling.SolverMode:
+def _checked_mode(
+    config: EstimatorConfig, motion1: FrameMotion, motion2: FrameMotion
+) -> sampling.SolverMode:
     """Mode of the solver; it may need gravity."""
     mode = sampling.MODES[config.solver]
     if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
-        raise InputError(f'solver {config.solver!r} requires gravity in both frames; without it, '
-                         'use auto, uniform_11pt or angular_5pt')
+        raise InputError(
+            f'solver {config.solver!r} requires gravity in both frames; without it, '
+            'use auto, uniform_11pt or angular_5pt'
+        )
     return mode
 
 
@@ -97,13 +113,22 @@ DEGENERATE_THRESHOLDS = 2.0
 
 
 def estimate_relative_pose(
-        points1: ArrayLike, points2: ArrayLike, camera: RollingShutterCamera, motion1: FrameMotion,
-        motion2: FrameMotion, relative_rotation: ArrayLike | None = None,
-        relative_rotation_covariance: ArrayLike | None = None, interval: float | None = None,
-        config: EstimatorConfig | None = None, rng: int | np.random.Generator = 0, *,
-        quality: ArrayLike | None = None, inertial: InertialMotion | None = None,
-        between: Sequence[IntermediateFrame] = (),
-        global_shutter_pixels: bool = False) -> RelativePose:
+    points1: ArrayLike,
+    points2: ArrayLike,
+    camera: RollingShutterCamera,
+    motion1: FrameMotion,
+    motion2: FrameMotion,
+    relative_rotation: ArrayLike | None = None,
+    relative_rotation_covariance: ArrayLike | None = None,
+    interval: float | None = None,
+    config: EstimatorConfig | None = None,
+    rng: int | np.random.Generator = 0,
+    *,
+    quality: ArrayLike | None = None,
+    inertial: InertialMotion | None = None,
+    between: Sequence[IntermediateFrame] = (),
+    global_shutter_pixels: bool = False,
+) -> RelativePose:
     """Relative pose of two rolling-shutter frames from matches, gyro and gravity.
 
     Parameters
@@ -146,23 +171,45 @@ def estimate_relative_pose(
     rotation, spread = checked_rotation(relative_rotation, relative_rotation_covariance)
     interval = frames_between.check(between, points1, _checked_interval(interval, inertial))
     mode = _checked_mode(config, motion1, motion2)
-    problem = build_problem(points1, points2, camera, motion1, motion2, rotation, spread,
-                            mode.model.derotated)
+    problem = build_problem(
+        points1, points2, camera, motion1, motion2, rotation, spread, mode.model.derotated
+    )
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
     pose = Estimation(problem, mode, config, order, seed, interval, inertial).run(bool(between))
-    pose = _certain(frames_between.refined(pose, points1, motion1, (
-        points2, motion2, interval, rotation, spread, inertial), between, camera, config), config)
+    pose = _certain(
+        frames_between.refined(
+            pose,
+            points1,
+            motion1,
+            (points2, motion2, interval, rotation, spread, inertial),
+            between,
+            camera,
+            config,
+        ),
+        config,
+    )
     if global_shutter_pixels and pose:
         pose = _with_global_shutter_pixels(pose, points1, points2, camera, motion1, motion2)
     return replace(pose, duration=time.perf_counter() - started)
 
 
-def _with_global_shutter_pixels(pose: RelativePose, points1: Array, points2: Array,
-                                camera: RollingShutterCamera, motion1: FrameMotion,
-                                motion2: FrameMotion) -> RelativePose:
+def _with_global_shutter_pixels(
+    pose: RelativePose,
+    points1: Array,
+    points2: Array,
+    camera: RollingShutterCamera,
+    motion1: FrameMotion,
+    motion2: FrameMotion,
+) -> RelativePose:
     times1, times2 = camera.row_times(points1[:, 1]), camera.row_times(points2[:, 1])
-    found = landmarks(pose, motion1.derotate(camera.unproject(points1), times1),
-                      motion2.derotate(camera.unproject(points2), times2), times1, times2, camera)
+    found = landmarks(
+        pose,
+        motion1.derotate(camera.unproject(points1), times1),
+        motion2.derotate(camera.unproject(points2), times2),
+        times1,
+        times2,
+        camera,
+    )
     return replace(pose, pixels1_gs=found.pixels1, pixels2_gs=found.pixels2)
 
 
@@ -174,8 +221,10 @@ def _certain(pose: RelativePose, config: EstimatorConfig) -> RelativePose:
     if not pose or sigma <= limit:
         return pose
     return pose.without_translation(
-        Status.LOW_PARALLAX, f'the direction of translation is uncertain by {sigma:.3g} deg '
-        f'(1 sigma), more than max_translation_sigma = {limit:g} deg')
+        Status.LOW_PARALLAX,
+        f'the direction of translation is uncertain by {sigma:.3g} deg '
+        f'(1 sigma), more than max_translation_sigma = {limit:g} deg',
+    )
 
 
 class Estimation:
@@ -190,14 +239,22 @@ class Estimation:
     `interval`: seconds between the frames.
     """
 
-    def __init__(self, problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
-                 order: NDArray[np.int64], seed: NDArray[np.uint64],
-                 interval: float | None, inertial: InertialMotion | None = None) -> None:
+    def __init__(
+        self,
+        problem: TwoViewProblem,
+        mode: SolverMode,
+        config: EstimatorConfig,
+        order: NDArray[np.int64],
+        seed: NDArray[np.uint64],
+        interval: float | None,
+        inertial: InertialMotion | None = None,
+    ) -> None:
         self.problem, self.mode, self.config = problem, mode, config
         self.order = order[problem.valid[order]]
         self.seed = seed
-        self.matches = RayMatches(problem.observations, problem.valid,
-                                  config.pixel_sigma / problem.focal)
+        self.matches = RayMatches(
+            problem.observations, problem.valid, config.pixel_sigma / problem.focal
+        )
         self.priors = _priors(problem, mode, config, interval)
         self.interval, self.inertial = interval, inertial
         # Prior of the velocities by the measured acceleration, and the chi-square (6 degrees of
@@ -205,17 +262,20 @@ class Estimation:
         self.measured: VelocityPrior | None = None
         self.inertial_chi2 = 0.0
         self.iterations = 0
-        self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
-                         else math.inf)
+        self.deadline = (
+            time.perf_counter() + config.time_limit if config.time_limit > 0.0 else math.inf
+        )
         # Whether solvers were skipped, since one before them had enough inliers.
         self.solvers_skipped = False
 
     def run(self, warm: bool = False) -> RelativePose:
         """The pose, or the reason why there is none; `warm`: samples only if `_by_gyro` fails."""
         if len(self.order) < self.config.min_inliers:
-            return self._failure(Status.TOO_FEW_MATCHES,
-                                 f'{len(self.order)} usable matches, fewer than min_inliers = '
-                                 f'{self.config.min_inliers}')
+            return self._failure(
+                Status.TOO_FEW_MATCHES,
+                f'{len(self.order)} usable matches, fewer than min_inliers = '
+                f'{self.config.min_inliers}',
+            )
         if warm and (state := self._by_gyro()) is not None:
             return self._completed(state)
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
@@ -229,14 +289,16 @@ class Estimation:
             # Inliers of an angular hypothesis by chance are outliers of the uniform model.
             state = self._best(self.sample(enough=1.0))
         if state is None:
-            return self._failure(Status.NO_CONSENSUS, 'no hypothesis is consistent with the '
-                                 'matches')
+            return self._failure(
+                Status.NO_CONSENSUS, 'no hypothesis is consistent with the matches'
+            )
         return self._completed(state)
 
     def _share(self, state: TwoViewState) -> float:
         """Share of the matches that are inliers of a state."""
-        return float(sampson.select_inliers(self.matches, state, self.config.threshold).sum()
-                     ) / len(self.order)
+        return float(
+            sampson.select_inliers(self.matches, state, self.config.threshold).sum()
+        ) / len(self.order)
 
     def _by_gyro(self) -> TwoViewState | None:
         """The state from the gyro's rotation, if it explains the matches."""
@@ -245,8 +307,9 @@ class Estimation:
             return None
         t = sampling.translation_direction(self.problem.observations[self.problem.valid], R)
         velocity = self.priors.velocity.rate * t
-        state = self._best(Solutions(np.ascontiguousarray(R)[None],
-                                     np.concatenate([t, velocity, velocity])[None]))
+        state = self._best(
+            Solutions(np.ascontiguousarray(R)[None], np.concatenate([t, velocity, velocity])[None])
+        )
         return state if state is not None and self._share(state) > CERTAIN else None
 
     def _completed(self, state: TwoViewState) -> RelativePose:
@@ -256,8 +319,9 @@ class Estimation:
         if reason := self._no_consensus(refined.inliers):
             return self._failure(Status.NO_CONSENSUS, reason)
         if reason := self._contradiction(refined.state):
-            return replace(self._failure(Status.NO_CONSENSUS, reason),
-                           rejected=self._result(refined))
+            return replace(
+                self._failure(Status.NO_CONSENSUS, reason), rejected=self._result(refined)
+            )
         # 4. Is the translation observable?
         rotation_only = self._rotation_only(refined)
         if rotation_only is not None:
@@ -268,16 +332,22 @@ class Estimation:
         implausible = (near < self.config.threshold) & ~refined.inliers
         count, others = np.count_nonzero(refined.inliers), np.count_nonzero(implausible)
         if self.config.refinement == 'map' and (
-                count - others < SIGN_SIGMAS * math.sqrt(count + others)):
-            return pose.without_translation(Status.LOW_PARALLAX, (
-                f'{others} of {count + others} matches on their epipolar lines lie behind the '
-                'cameras or far from the others, nearly as many as by chance'))
+            count - others < SIGN_SIGMAS * math.sqrt(count + others)
+        ):
+            return pose.without_translation(
+                Status.LOW_PARALLAX,
+                (
+                    f'{others} of {count + others} matches on their epipolar lines lie behind the '
+                    'cameras or far from the others, nearly as many as by chance'
+                ),
+            )
         return pose
 
     def sample(self, enough: float = ENOUGH) -> Solutions:
         """The best hypotheses, by one solver after another until the inlier share is `enough`."""
         hypotheses, samples, self.solvers_skipped = sampling.draw_hypotheses(
-            self.problem, self.mode, self.config, self.order, self.seed, enough, self.deadline)
+            self.problem, self.mode, self.config, self.order, self.seed, enough, self.deadline
+        )
         self.iterations += samples
         return hypotheses
 
@@ -288,8 +358,9 @@ class Estimation:
         if config.refinement != 'map':
             # As in the paper: the best hypothesis, unchanged.
             return self._in_front(priors.hypothesis_state(hypotheses.R[0], hypotheses.x[0]))
-        state, found = sampling.optimise(self.matches, hypotheses, self.priors,
-                                         config.pixel_sigma, config.threshold)
+        state, found = sampling.optimise(
+            self.matches, hypotheses, self.priors, config.pixel_sigma, config.threshold
+        )
         return state if found else None
 
     def _in_front(self, state: TwoViewState) -> TwoViewState:
@@ -307,13 +378,22 @@ class Estimation:
             prior, scales = self.priors, velocity.TIMELESS if free else velocity.AT_ZERO
             if free and self.interval is not None:
                 expected, scales = velocity.expected_velocities(
-                    self.problem, config.motion, self.interval, self.inertial)
+                    self.problem, config.motion, self.interval, self.inertial
+                )
                 prior = priors.with_velocity(prior, expected)
                 self.measured = None if self.inertial is None else expected
                 self.inertial_chi2 = float(
-                    expected.offset @ expected.information @ expected.offset)
-            return velocity.fit_with_evidence(matches, state, prior, config.pixel_sigma,
-                                              config.threshold, scales, self._gyro_error())
+                    expected.offset @ expected.information @ expected.offset
+                )
+            return velocity.fit_with_evidence(
+                matches,
+                state,
+                prior,
+                config.pixel_sigma,
+                config.threshold,
+                scales,
+                self._gyro_error(),
+            )
         inliers = sampson.select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
             used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
@@ -321,8 +401,14 @@ class Estimation:
             inliers = sampson.select_inliers(matches, state, config.threshold)
         used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
         log_scale = self.priors.velocity.log_scale
-        return Refined(state, inliers, log_scale, math.exp(-log_scale), config.pixel_sigma,
-                       covariance.local_covariance(used, state, self.priors))
+        return Refined(
+            state,
+            inliers,
+            log_scale,
+            math.exp(-log_scale),
+            config.pixel_sigma,
+            covariance.local_covariance(used, state, self.priors),
+        )
 
     def _gyro_error(self) -> Array:
         """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
@@ -334,14 +420,15 @@ class Estimation:
         problem, sigma = self.problem, self.config.stamp_sigma
         if problem.rotation is None or sigma == 0.0:
             return np.zeros((3, 3))
-        rates = np.column_stack([problem.motion1.angular_velocity,
-                                 problem.rotation @ problem.motion2.angular_velocity])
+        rates = np.column_stack(
+            [problem.motion1.angular_velocity, problem.rotation @ problem.motion2.angular_velocity]
+        )
         return np.asarray(sigma**2 * rates @ rates.T)
 
     def _no_consensus(self, inliers: Flags) -> str:
         """Reason why the inliers determine no pose; empty if they may."""
         config, observations = self.config, self.problem.observations
-        cell = config.threshold / self.problem.focal   # [rad]
+        cell = config.threshold / self.problem.focal  # [rad]
         count = min(sampling.distinct_directions(observations, inliers, f, cell) for f in RAYS)
         # Inliers of the best of many fits to random matches (about 5 sigma). Their share, ten
         # thresholds by the focal length, was measured: free velocities bend the epipolar bands, so
@@ -349,10 +436,14 @@ class Estimation:
         expected = len(self.order) * min(10.0 * config.threshold / self.problem.focal, 0.5)
         chance = int(expected + 5.0 * np.sqrt(expected)) + self.mode.fitted_points
         if count < max(config.min_inliers, chance):
-            return (f'{count} distinct of {len(self.order)} matches agree, fewer than '
-                    f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
-        if min(sampling.distance_from_a_plane(observations, inliers, f)
-               for f in RAYS) < DEGENERATE_THRESHOLDS * cell:
+            return (
+                f'{count} distinct of {len(self.order)} matches agree, fewer than '
+                f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)'
+            )
+        if (
+            min(sampling.distance_from_a_plane(observations, inliers, f) for f in RAYS)
+            < DEGENERATE_THRESHOLDS * cell
+        ):
             return f'the {count} matches that agree lie on one line: the pose is not observable'
         return ''
 
@@ -364,8 +455,10 @@ class Estimation:
         if gain < CONTRADICTION:
             return ''
         apart = np.degrees(np.linalg.norm(so3.log_so3(R @ state.R.T)))
-        return (f'images and gyro contradict each other: a rotation {apart:.1f} deg from the '
-                f"gyro's fits the matches better (log-likelihood +{gain:.0f})")
+        return (
+            f'images and gyro contradict each other: a rotation {apart:.1f} deg from the '
+            f"gyro's fits the matches better (log-likelihood +{gain:.0f})"
+        )
 
     def _rotation_only(self, refined: Refined) -> RelativePose | None:
         """The result without a translation if none is observable, otherwise None.
@@ -375,24 +468,36 @@ class Estimation:
         """
         problem, config = self.problem, self.config
         state, inliers, sigma = refined.state, refined.inliers, refined.sigma
-        parallax = so3.median(fit.transfer_errors(
-            problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal))
+        parallax = so3.median(
+            fit.transfer_errors(
+                problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal
+            )
+        )
         # Not from the rotation of the pose, which is arbitrary for points on a line.
         start = so3.aligning_rotation(sampling.correlation(problem.observations, inliers, *RAYS))
         R, information = fit.fit_rotation(
-            problem.observations, inliers, start, self.priors, problem.focal, sigma)
+            problem.observations, inliers, start, self.priors, problem.focal, sigma
+        )
         left = fit.transfer_errors(problem.observations, inliers, R, problem.focal)
         median = so3.median(left.copy())
         pure_rotation = median < ROTATION_ONLY_SIGMAS * sigma
         if not pure_rotation and parallax >= config.min_parallax:
             return None
-        reason = (f'a rotation alone leaves {median:.2f} px in the median, the noise of '
-                  'the matches: the translation is not observable') if pure_rotation else (
-                  f'median parallax of {parallax:.2f} px is below min_parallax = '
-                  f'{config.min_parallax:g} px')
+        reason = (
+            (
+                f'a rotation alone leaves {median:.2f} px in the median, the noise of '
+                'the matches: the translation is not observable'
+            )
+            if pure_rotation
+            else (
+                f'median parallax of {parallax:.2f} px is below min_parallax = '
+                f'{config.min_parallax:g} px'
+            )
+        )
         # Back to the reference row, without the translation.
         turn1, turn2 = self._rotations_to_reference_row(
-            state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)))
+            state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3))
+        )
         of_pose = np.full((6, 6), np.nan)
         # No rotation has a sigma above half a turn: points in one place determine two angles only.
         fitted = priors.inverse(information + np.eye(3) / np.pi**2)
@@ -402,15 +507,25 @@ class Estimation:
         velocity_covariance = np.full((6, 6), np.nan)
         velocity_covariance[3:, 3:] = config.gyro_sigma**2 * np.eye(3)
         return RelativePose(
-            status=Status.PURE_ROTATION if pure_rotation else Status.LOW_PARALLAX, reason=reason,
-            R=turn1.T @ R @ turn2, covariance=of_pose, inliers=inliers,
+            status=Status.PURE_ROTATION if pure_rotation else Status.LOW_PARALLAX,
+            reason=reason,
+            R=turn1.T @ R @ turn2,
+            covariance=of_pose,
+            inliers=inliers,
             images=covariance.rotation_information(
-                R, information, self.priors.rotation_information,
-                so3.log_so3(R @ self.priors.rotation.T), -problem.reference_row_time),
+                R,
+                information,
+                self.priors.rotation_information,
+                so3.log_so3(R @ self.priors.rotation.T),
+                -problem.reference_row_time,
+            ),
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
-            velocity_covariance=velocity_covariance, model='angular',
-            iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
+            velocity_covariance=velocity_covariance,
+            model='angular',
+            iterations=self.iterations,
+            residual_rms=float(np.sqrt(np.mean(left**2))),
+        )
 
     def _rotations_to_reference_row(self, state: TwoViewState) -> tuple[Array, Array]:
         """Rotation of each camera from the middle row to the reference row, as corrected."""
@@ -419,70 +534,117 @@ class Estimation:
         problem, delay = self.problem, self.problem.reference_row_time
         turn1 = problem.motion1.rotations([delay])[0]
         turn2 = problem.motion2.rotations([delay])[0]
-        return (so3.exp_so3(delay * state.dw1) @ turn1,
-                so3.exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
+        return (
+            so3.exp_so3(delay * state.dw1) @ turn1,
+            so3.exp_so3(delay * (state.R.T @ state.dw2)) @ turn2,
+        )
 
     def _result(self, refined: Refined) -> RelativePose:
-        at_middle = covariance.pair_state(self.problem, refined.state, refined.log_scale,
-                                          refined.covariance)
-        pose = to_reference_row(at_middle, self.problem.reference_row_time,
-                                *self._rotations_to_reference_row(refined.state))
+        at_middle = covariance.pair_state(
+            self.problem, refined.state, refined.log_scale, refined.covariance
+        )
+        pose = to_reference_row(
+            at_middle,
+            self.problem.reference_row_time,
+            *self._rotations_to_reference_row(refined.state),
+        )
         r = sampson.residuals(self.problem.observations, refined.state)[refined.inliers]
         v2w2 = np.r_[9:12, 15:18]
-        baseline, baseline_sigma, reason = self._baseline(pose.log_baseline,
-                                                          pose.covariance[18, 18])
+        baseline, baseline_sigma, reason = self._baseline(
+            pose.log_baseline, pose.covariance[18, 18]
+        )
         images = self._images(refined)
         return RelativePose(
-            status=Status.OK, R=pose.R, t=pose.t, linear_velocity1=pose.v1,
-            linear_velocity2=pose.v2, angular_velocity1=pose.w1, angular_velocity2=pose.w2,
-            inliers=refined.inliers, covariance=pose.covariance[:6, :6],
-            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
+            status=Status.OK,
+            R=pose.R,
+            t=pose.t,
+            linear_velocity1=pose.v1,
+            linear_velocity2=pose.v2,
+            angular_velocity1=pose.w1,
+            angular_velocity2=pose.w2,
+            inliers=refined.inliers,
+            covariance=pose.covariance[:6, :6],
+            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)],
+            model=self.mode.model.name,
             velocity_sigma=refined.velocity_sigma,
-            baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
-            images=images, inertial_evidence=self._evidence(images),
-            iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(r**2))),
-            pixel_sigma=refined.sigma)
+            baseline=baseline,
+            baseline_log_sigma=baseline_sigma,
+            baseline_reason=reason,
+            images=images,
+            inertial_evidence=self._evidence(images),
+            iterations=self.iterations,
+            residual_rms=float(np.sqrt(np.mean(r**2))),
+            pixel_sigma=refined.sigma,
+        )
 
     def _images(self, refined: Refined) -> covariance.ImageInformation | None:
         """Information of the images alone; None for models without all unknowns."""
         if not self.mode.model.derotated:
             return None
         state, observations = refined.state, self.problem.observations
-        weights, sigma = sampson.noise_mixture(sampson.residuals(observations, state),
-                                               refined.inliers, self.config.pixel_sigma)
-        return covariance.image_information(fit.FitMatches(observations, weights, sigma), state,
-                                            self.priors, -self.problem.reference_row_time)
+        weights, sigma = sampson.noise_mixture(
+            sampson.residuals(observations, state), refined.inliers, self.config.pixel_sigma
+        )
+        return covariance.image_information(
+            fit.FitMatches(observations, weights, sigma),
+            state,
+            self.priors,
+            -self.problem.reference_row_time,
+        )
 
-    def _evidence(self, images: covariance.ImageInformation | None,
-                  ) -> velocity.InertialEvidence | None:
+    def _evidence(
+        self,
+        images: covariance.ImageInformation | None,
+    ) -> velocity.InertialEvidence | None:
         """Whether the images are consistent with the measured acceleration."""
         if images is None or self.measured is None or self.interval is None:
             return None
-        return velocity.inertial_evidence(self.problem, images, self.config.motion, self.interval,
-                                          self.measured)
+        return velocity.inertial_evidence(
+            self.problem, images, self.config.motion, self.interval, self.measured
+        )
 
     def _baseline(self, log_baseline: float, variance: float) -> tuple[float, float, str]:
         """Baseline [m] and 1 sigma of its logarithm; or NaN twice and the reason."""
         if self.inertial is None:
-            return math.nan, math.nan, ('baseline not known: no acceleration between the frames '
-                                        'is given (inertial)')
+            return (
+                math.nan,
+                math.nan,
+                ('baseline not known: no acceleration between the frames is given (inertial)'),
+            )
         sigma = math.sqrt(max(variance, 0.0))
         if self.inertial_chi2 < LEAST_ACCELERATION:
-            return math.nan, math.nan, ('baseline not known: the acceleration between the frames '
-                                        'is within its own errors')
+            return (
+                math.nan,
+                math.nan,
+                (
+                    'baseline not known: the acceleration between the frames '
+                    'is within its own errors'
+                ),
+            )
         if not (self.mode.model.derotated and sigma <= MOST_LOG_SIGMA):
-            return math.nan, math.nan, ('baseline not known: not observable from the velocities '
-                                        'in the images and the acceleration')
+            return (
+                math.nan,
+                math.nan,
+                (
+                    'baseline not known: not observable from the velocities '
+                    'in the images and the acceleration'
+                ),
+            )
         return math.exp(log_baseline), sigma, ''
 
     def _failure(self, status: Status, reason: str) -> RelativePose:
-        return RelativePose(status=status, reason=reason, model=self.mode.model.name,
-                            iterations=self.iterations,
-                            inliers=np.zeros(len(self.problem.valid), dtype=bool))
+        return RelativePose(
+            status=status,
+            reason=reason,
+            model=self.mode.model.name,
+            iterations=self.iterations,
+            inliers=np.zeros(len(self.problem.valid), dtype=bool),
+        )
 
 
-def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
-            interval: float | None) -> Priors:
+def _priors(
+    problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig, interval: float | None
+) -> Priors:
     """Priors of the IMU; velocities with the wide prior of the comparison of hypotheses."""
     g1, g2 = problem.motion1.gravity, problem.motion2.gravity
     known = g1 is not None and g2 is not None
@@ -490,9 +652,15 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
     unit1, unit2 = (np.zeros(3) if g is None else g / np.linalg.norm(g) for g in (g1, g2))
     rotation, information = problem.rotation, problem.rotation_information
     return Priors(
-        unit1, unit2, config.gravity_sigma**-2 if known else 0.0, problem.reference_row_time,
+        unit1,
+        unit2,
+        config.gravity_sigma**-2 if known else 0.0,
+        problem.reference_row_time,
         config.gyro_sigma**-2 if mode.model.derotated else priors.PINNED,
         np.eye(3) if rotation is None else np.ascontiguousarray(rotation),
         np.zeros((3, 3)) if information is None else np.ascontiguousarray(information),
-        priors.isotropic(SAMPLING_VELOCITY_SIGMA if free else priors.PINNED**-0.5,
-                         1.0 / interval if free and interval is not None else 0.0))
+        priors.isotropic(
+            SAMPLING_VELOCITY_SIGMA if free else priors.PINNED**-0.5,
+            1.0 / interval if free and interval is not None else 0.0,
+        ),
+    )

@@ -27,9 +27,9 @@ LEAST_GAIN = 1e-7
 class FitMatches(NamedTuple):
     """The matches of a fit."""
 
-    observations: Array   # (N, 20)
-    weights: Array   # (N,) 0 to 1
-    sigma: float   # noise [px] of a match of weight 1
+    observations: Array  # (N, 20)
+    weights: Array  # (N,) 0 to 1
+    sigma: float  # noise [px] of a match of weight 1
 
 
 class DataTerm(NamedTuple):
@@ -44,14 +44,14 @@ class DataTerm(NamedTuple):
 def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
     """Hessian (17, 17), half gradient (17,) and cost of the matches about `state`."""
     hessian, gradient, squares = sampson.normal_equations(
-        matches.observations, matches.weights, state)
+        matches.observations, matches.weights, state
+    )
     weight = 1.0 / (matches.sigma * matches.sigma)
     return DataTerm(hessian * weight, gradient * weight, squares * weight)
 
 
 @kernel
-def with_priors(data: DataTerm, state: TwoViewState,
-                prior: Priors) -> tuple[Array, Array, float]:
+def with_priors(data: DataTerm, state: TwoViewState, prior: Priors) -> tuple[Array, Array, float]:
     """Hessian (n, n), half gradient (n,) and cost of the whole objective at `state`."""
     n = priors.unknowns(prior)
     hessian, gradient = np.zeros((n, n)), np.zeros(n)
@@ -62,8 +62,9 @@ def with_priors(data: DataTerm, state: TwoViewState,
 
 
 @kernel
-def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors,
-        iterations: int) -> tuple[TwoViewState, float, DataTerm, float, Array]:
+def fit(
+    matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors, iterations: int
+) -> tuple[TwoViewState, float, DataTerm, float, Array]:
     """Levenberg-Marquardt from `start`, about which `data` is, and the scale of `prior`.
 
     Returns the state, the logarithm of the velocities' scale, the data term about that state, and
@@ -90,8 +91,9 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors,
         candidate, candidate_prior = priors.moved(state, step), prior
         if n > SCALE:
             velocity = prior.velocity
-            candidate_prior = priors.at_scale(prior, velocity.log_scale + step[SCALE],
-                                              velocity.centre, velocity.freedom)
+            candidate_prior = priors.at_scale(
+                prior, velocity.log_scale + step[SCALE], velocity.centre, velocity.freedom
+            )
         # Most steps are accepted: their derivatives cost little more than the residuals alone.
         next_data = linearised(matches, candidate)
         next_hessian, next_gradient, next_cost = with_priors(next_data, candidate, candidate_prior)
@@ -107,8 +109,9 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors,
 
 
 @kernel
-def gauss_newton(matches: FitMatches, start: TwoViewState, prior: Priors,
-                 steps: int) -> TwoViewState:
+def gauss_newton(
+    matches: FitMatches, start: TwoViewState, prior: Priors, steps: int
+) -> TwoViewState:
     """The state after some Gauss-Newton steps from `start`, without a test of the cost."""
     state = start
     factor = np.zeros((PARAMETERS, PARAMETERS))
@@ -134,8 +137,7 @@ ALTERNATIONS = 10
 
 
 @kernel
-def refine_alternating(matches: FitMatches, start: TwoViewState,
-                       velocities: bool) -> TwoViewState:
+def refine_alternating(matches: FitMatches, start: TwoViewState, velocities: bool) -> TwoViewState:
     """Refine a state by alternation; gyro corrections, and d without `velocities`, are kept."""
     state, cost = start, math.inf
     for _ in range(ALTERNATIONS):
@@ -149,8 +151,9 @@ def refine_alternating(matches: FitMatches, start: TwoViewState,
 
 
 @kernel
-def _refine_part(matches: FitMatches, state: TwoViewState, first: int,
-                 end: int) -> tuple[TwoViewState, float]:
+def _refine_part(
+    matches: FitMatches, state: TwoViewState, first: int, end: int
+) -> tuple[TwoViewState, float]:
     """Levenberg-Marquardt over the unknowns from `first` to before `end`; also the cost."""
     hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     factor, step = np.zeros((end - first, end - first)), np.zeros(PARAMETERS)
@@ -165,7 +168,7 @@ def _refine_part(matches: FitMatches, state: TwoViewState, first: int,
             if gain <= 1e-8 * cost:
                 break
             hessian, gradient = data.hessian, data.gradient
-            gradient[priors.D1:priors.DW1] += VELOCITY_WEIGHT * d
+            gradient[priors.D1 : priors.DW1] += VELOCITY_WEIGHT * d
             for i in range(priors.D1, priors.DW1):
                 hessian[i, i] += VELOCITY_WEIGHT
         damped = hessian[first:end, first:end].copy()
@@ -184,8 +187,7 @@ ROTATION_ITERATIONS = 12
 
 
 @kernel
-def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array,
-                    focal: float) -> Array:
+def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array, focal: float) -> Array:
     """``|f_1 - R f_2|`` [px] of the matches in `use`: their residual motion after a rotation."""
     out = np.empty(use.sum())
     count = 0
@@ -203,8 +205,14 @@ def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array,
 
 
 @kernel
-def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, prior: Priors,
-                 focal: float, sigma: float) -> tuple[Array, Array]:
+def fit_rotation(
+    observations: Array,
+    valid: NDArray[np.bool_],
+    start: Array,
+    prior: Priors,
+    focal: float,
+    sigma: float,
+) -> tuple[Array, Array]:
     """Rotation (3, 3) and the information (3, 3) of its error in frame 1.
 
     Iteratively reweighted (Cauchy, scale 2 sigma); the prior on the rotation is the gyro's.

@@ -54,15 +54,17 @@ class TwoViewState(NamedTuple):
 @kernel
 def hypothesis_state(R: Array, x: Array) -> TwoViewState:
     """The state of a hypothesis: R (3, 3) and ``x = (t, d_1, d_2)``, gyro as measured."""
-    return TwoViewState(R.copy(), x[0:3].copy(), x[3:6].copy(), x[6:9].copy(), np.zeros(3),
-                        np.zeros(3))
+    return TwoViewState(
+        R.copy(), x[0:3].copy(), x[3:6].copy(), x[6:9].copy(), np.zeros(3), np.zeros(3)
+    )
 
 
 @kernel
 def signed(state: TwoViewState, sign: float) -> TwoViewState:
     """The state with its translation and velocities multiplied by `sign`."""
-    return TwoViewState(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1,
-                        state.dw2)
+    return TwoViewState(
+        state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1, state.dw2
+    )
 
 
 @kernel
@@ -106,13 +108,13 @@ PINNED = 1e14
 class VelocityPrior(NamedTuple):
     """Prior of the linear velocities: ``u = b (d - c t) + a`` of information W."""
 
-    rate: float   # c
-    offset: Array   # a (6,)
-    information: Array   # W (6, 6)
-    log_scale: float   # current ``log b``
-    centre: float   # mean of its prior, and its inverse variance: 0 if it is known
+    rate: float  # c
+    offset: Array  # a (6,)
+    information: Array  # W (6, 6)
+    log_scale: float  # current ``log b``
+    centre: float  # mean of its prior, and its inverse variance: 0 if it is known
     weight: float
-    freedom: float   # g, as above
+    freedom: float  # g, as above
 
 
 class Priors(NamedTuple):
@@ -121,7 +123,7 @@ class Priors(NamedTuple):
     gravity1: Array
     gravity2: Array
     gravity_weight: float
-    gravity_row_time: float   # [s] of its measurement; rotated from there by the gyro
+    gravity_row_time: float  # [s] of its measurement; rotated from there by the gyro
     rate_weight: float
     rotation: Array
     rotation_information: Array
@@ -131,17 +133,28 @@ class Priors(NamedTuple):
 @kernel
 def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
     """The priors with another one of the linear velocities."""
-    return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight,
-                  priors.gravity_row_time, priors.rate_weight, priors.rotation,
-                  priors.rotation_information, velocity)
+    return Priors(
+        priors.gravity1,
+        priors.gravity2,
+        priors.gravity_weight,
+        priors.gravity_row_time,
+        priors.rate_weight,
+        priors.rotation,
+        priors.rotation_information,
+        velocity,
+    )
 
 
 @small_kernel
 def at_scale(priors: Priors, log_scale: float, centre: float, freedom: float) -> Priors:
     """The priors with another ``log b``, its prior mean, and g."""
     prior = priors.velocity
-    return with_velocity(priors, VelocityPrior(
-        prior.rate, prior.offset, prior.information, log_scale, centre, prior.weight, freedom))
+    return with_velocity(
+        priors,
+        VelocityPrior(
+            prior.rate, prior.offset, prior.information, log_scale, centre, prior.weight, freedom
+        ),
+    )
 
 
 def isotropic(sigma: float, rate: float) -> VelocityPrior:
@@ -188,8 +201,9 @@ def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: 
 
 
 @kernel
-def add_velocities(state: TwoViewState, prior: VelocityPrior, hessian: Array,
-                   gradient: Array) -> float:
+def add_velocities(
+    state: TwoViewState, prior: VelocityPrior, hessian: Array, gradient: Array
+) -> float:
     """``u^T W u`` of both velocities; t moves in its tangent plane."""
     b, c, W = math.exp(prior.log_scale), prior.rate, prior.information
     basis = tangent_basis(state.t)
@@ -262,6 +276,7 @@ def prior_cost(state: TwoViewState, priors: Priors) -> float:
 
 # -- Information matrices (inverse covariances): badly scaled, but never indefinite ---------------
 
+
 @kernel
 def _scaled_factor(information: Array) -> tuple[Array, Array]:
     """Scales (n,) that make the diagonal 1, and the Cholesky factor of the matrix so scaled.
@@ -291,7 +306,7 @@ def inverse(information: Array) -> Array:
     scale, factor = _scaled_factor(information)
     n = len(scale)
     rows = np.zeros((n, n))
-    for j in range(n):   # the inverse of the factor, column by column
+    for j in range(n):  # the inverse of the factor, column by column
         rows[j, j] = 1.0 / factor[j, j]
         for i in range(j + 1, n):
             value = 0.0

@@ -21,16 +21,16 @@ from rs_relpose_ros.jit import kernel
 class TwoViewProblem:
     """Matches and IMU measurements of one pair, frames at their middle rows."""
 
-    observations: Array   # (N, 20) rows of `sampson`; zero if a match cannot be unprojected
-    points: Array   # (6, N) columns of `sampling.multi_scale_cost`
-    valid: NDArray[np.bool_]   # (N,) matches with finite rays
-    focal: float   # [px] mean focal length: pixels per radian at the image centre
+    observations: Array  # (N, 20) rows of `sampson`; zero if a match cannot be unprojected
+    points: Array  # (6, N) columns of `sampling.multi_scale_cost`
+    valid: NDArray[np.bool_]  # (N,) matches with finite rays
+    focal: float  # [px] mean focal length: pixels per radian at the image centre
     motion1: FrameMotion
     motion2: FrameMotion
     # [s] of the user's reference row, at which gravity was measured, from the middle row
     reference_row_time: float
-    rotation: Array | None   # (3, 3) R_1^T R_2 by the gyro
-    rotation_information: Array | None   # (3, 3) inverse covariance of its error in frame 1
+    rotation: Array | None  # (3, 3) R_1^T R_2 by the gyro
+    rotation_information: Array | None  # (3, 3) inverse covariance of its error in frame 1
 
 
 def middle_row_delay(camera: RollingShutterCamera) -> float:
@@ -38,10 +38,16 @@ def middle_row_delay(camera: RollingShutterCamera) -> float:
     return float(camera.row_times((camera.height - 1) / 2))
 
 
-def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
-                  motion1: FrameMotion, motion2: FrameMotion, relative_rotation: Array | None,
-                  relative_rotation_covariance: Array | None,
-                  by_gyro: bool = True) -> TwoViewProblem:
+def build_problem(
+    points1: Array,
+    points2: Array,
+    camera: RollingShutterCamera,
+    motion1: FrameMotion,
+    motion2: FrameMotion,
+    relative_rotation: Array | None,
+    relative_rotation_covariance: Array | None,
+    by_gyro: bool = True,
+) -> TwoViewProblem:
     """Unproject, derotate and move to the middle row.
 
     Without `by_gyro` (models without angular velocity: linear, global) rays are as measured.
@@ -62,19 +68,33 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
     for k, (pixels, motion) in enumerate(((points1, motion1), (points2, motion2))):
         rays, jacobian = camera.unproject_with_jacobian(pixels)
         tau = camera.row_times(pixels[:, 1]) - delay
-        rotations, rate = ((motion.rotations(tau), motion.angular_velocity) if by_gyro
-                           else (np.tile(np.eye(3), (len(tau), 1, 1)), np.zeros(3)))
-        derotate(rays, jacobian, rotations, camera.line_delay * rate,
-                 observations[:, 9 * k:9 * k + 9])
+        rotations, rate = (
+            (motion.rotations(tau), motion.angular_velocity)
+            if by_gyro
+            else (np.tile(np.eye(3), (len(tau), 1, 1)), np.zeros(3))
+        )
+        derotate(
+            rays, jacobian, rotations, camera.line_delay * rate, observations[:, 9 * k : 9 * k + 9]
+        )
         observations[:, 18 + k] = tau
     valid, points = _checked_columns(observations)
-    return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
-                          motion2, -delay, rotation, information)
+    return TwoViewProblem(
+        observations,
+        points,
+        valid,
+        0.5 * (camera.fx + camera.fy),
+        motion1,
+        motion2,
+        -delay,
+        rotation,
+        information,
+    )
 
 
 @kernel
-def derotate(rays: Array, jacobian: Array, rotations: Array, row_rotation: Array,
-             block: Array) -> None:
+def derotate(
+    rays: Array, jacobian: Array, rotations: Array, row_rotation: Array, block: Array
+) -> None:
     """Fill one camera's `block` (N, 9): derotated ray and its derivatives by u and v."""
     for i in range(len(rays)):
         for j in range(3):
@@ -145,8 +165,16 @@ def to_reference_row(state: PairState, delay: float, e1: Array, e2: Array) -> Pa
     TT, TH, V1, V2, W1, W2 = (slice(3 * k, 3 * k + 3) for k in range(6))
     # t_true = t + dt, R_true = Exp(th) R: baseline' = E1^T (dt - D dv1 + D R dv2 - D [R v2]x th
     #   + D [baseline]x dw1), with rate errors as Exp(D dw_i) E_i.
-    by = np.hstack([eye, -delay * skew(state.R @ state.v2), -delay * eye, delay * state.R,
-                    delay * skew(baseline), np.zeros((3, 4))])
+    by = np.hstack(
+        [
+            eye,
+            -delay * skew(state.R @ state.v2),
+            -delay * eye,
+            delay * state.R,
+            delay * skew(baseline),
+            np.zeros((3, 4)),
+        ]
+    )
     by = e1.T @ by / scale
     jacobian[TT] = (eye - np.outer(t, t)) @ by
     # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates rotate the rows.
@@ -162,5 +190,13 @@ def to_reference_row(state: PairState, delay: float, e1: Array, e2: Array) -> Pa
     jacobian[W1, W1] = jacobian[W2, W2] = eye
     jacobian[18] = along
     jacobian[18, 18] += 1.0
-    return PairState(R, t, v1, v2, state.w1, state.w2, state.log_baseline + math.log(scale),
-                     jacobian @ state.covariance @ jacobian.T)
+    return PairState(
+        R,
+        t,
+        v1,
+        v2,
+        state.w1,
+        state.w2,
+        state.log_baseline + math.log(scale),
+        jacobian @ state.covariance @ jacobian.T,
+    )

@@ -26,7 +26,7 @@ class Status(str, Enum):
     LOW_PARALLAX = 'LOW_PARALLAX'
     PURE_ROTATION = 'PURE_ROTATION'
     BAD_INPUT = 'BAD_INPUT'
-    WITHHELD = 'WITHHELD'   # a configured parameter of camera or IMU contradicts the data
+    WITHHELD = 'WITHHELD'  # a configured parameter of camera or IMU contradicts the data
 
 
 def _nan(*shape: int) -> Array:
@@ -151,16 +151,23 @@ class RelativePose:
         for matrix in (covariance, velocity_covariance):
             matrix[:3] = matrix[:, :3] = np.nan
         return replace(
-            self.without_baseline(''), status=status, reason=reason, t=_nan(3),
-            linear_velocity1=_nan(3), linear_velocity1_covariance=_nan(3, 3),
-            linear_velocity2=_nan(3), covariance=covariance,
+            self.without_baseline(''),
+            status=status,
+            reason=reason,
+            t=_nan(3),
+            linear_velocity1=_nan(3),
+            linear_velocity1_covariance=_nan(3, 3),
+            linear_velocity2=_nan(3),
+            covariance=covariance,
             images=None if self.images is None else self.images.of_rotation(),
-            velocity_covariance=velocity_covariance)
+            velocity_covariance=velocity_covariance,
+        )
 
     def without_baseline(self, reason: str) -> RelativePose:
         """The same without a baseline, and the reason."""
-        return replace(self, baseline=float('nan'), baseline_log_sigma=float('nan'),
-                       baseline_reason=reason)
+        return replace(
+            self, baseline=float('nan'), baseline_log_sigma=float('nan'), baseline_reason=reason
+        )
 
     def inverse(self) -> RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly.
@@ -175,12 +182,21 @@ class RelativePose:
         # Known without a translation, too, whose NaN spreads through the product.
         covariance[3:, 3:] = R_inv @ self.covariance[3:, 3:] @ self.R
         return replace(
-            self, R=R_inv, t=-R_inv @ self.t, linear_velocity1=self.linear_velocity2,
+            self,
+            R=R_inv,
+            t=-R_inv @ self.t,
+            linear_velocity1=self.linear_velocity2,
             linear_velocity1_covariance=_nan(3, 3),
-            linear_velocity2=self.linear_velocity1, angular_velocity1=self.angular_velocity2,
-            angular_velocity2=self.angular_velocity1, covariance=covariance,
-            velocity_covariance=_nan(6, 6), images=None, inertial_evidence=None, pixels1_gs=None,
-            pixels2_gs=None)
+            linear_velocity2=self.linear_velocity1,
+            angular_velocity1=self.angular_velocity2,
+            angular_velocity2=self.angular_velocity1,
+            covariance=covariance,
+            velocity_covariance=_nan(6, 6),
+            images=None,
+            inertial_evidence=None,
+            pixels1_gs=None,
+            pixels2_gs=None,
+        )
 
 
 # -- Landmarks and equivalent global-shutter pixels -----------------------------------------------
@@ -197,8 +213,9 @@ _PARALLEL = 4e-8
 
 
 @kernel
-def depths_of_rays(f1: Array, f2: Array, baselines: Array,
-                   parallel: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+def depths_of_rays(
+    f1: Array, f2: Array, baselines: Array, parallel: float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Depths l (N,) of ``l_1 f_1 = b + l_2 f_2`` by least squares, and whether they are usable.
 
     Rays (N, 3) are in one frame. Not usable (1) behind a camera, or if the squared sine of the
@@ -209,8 +226,10 @@ def depths_of_rays(f1: Array, f2: Array, baselines: Array,
         normal = cross(f1[i], f2[i])
         squared = dot(normal, normal)
         # The cross products of that equation with f_2 and f_1.
-        by_f2, by_f1 = (dot(cross(baselines[i], f2[i]), normal),
-                        dot(cross(baselines[i], f1[i]), normal))
+        by_f2, by_f1 = (
+            dot(cross(baselines[i], f2[i]), normal),
+            dot(cross(baselines[i], f1[i]), normal),
+        )
         if squared > parallel and by_f2 > 0.0 and by_f1 > 0.0:
             l1[i], l2[i], usable[i] = by_f2 / squared, by_f1 / squared, True
     return l1, l2, usable
@@ -227,8 +246,14 @@ class Landmarks(NamedTuple):
     points: Array
 
 
-def landmarks(pose: RelativePose, rays1: Array, rays2: Array, row_times1: Array, row_times2: Array,
-              camera: RollingShutterCamera) -> Landmarks:
+def landmarks(
+    pose: RelativePose,
+    rays1: Array,
+    rays2: Array,
+    row_times1: Array,
+    row_times2: Array,
+    camera: RollingShutterCamera,
+) -> Landmarks:
     """Landmarks of the inliers of a pose, pixels on the sensor.
 
     `rays*` (N, 3): unit rays of the matches, derotated to the stamped row of their frame.
@@ -239,8 +264,7 @@ def landmarks(pose: RelativePose, rays1: Array, rays2: Array, row_times1: Array,
     moved1 = row_times1[inliers, None] * pose.linear_velocity1
     moved2 = row_times2[inliers, None] * pose.linear_velocity2
     in_first = f2 @ pose.R.T
-    l1, l2, near = depths_of_rays(f1, in_first, pose.t + moved2 @ pose.R.T - moved1,
-                                  _PARALLEL)
+    l1, l2, near = depths_of_rays(f1, in_first, pose.t + moved2 @ pose.R.T - moved1, _PARALLEL)
     # Inverse distances: 0 at infinity.
     equal1 = f1 + (near / l1)[:, None] * moved1
     equal2 = f2 + (near / l2)[:, None] * moved2

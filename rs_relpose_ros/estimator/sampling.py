@@ -40,8 +40,9 @@ BLOCK = 64
 
 
 @small_kernel
-def multi_scale_cost(points: Array, R: Array, x: Array, threshold2: Array,
-                     limit: float) -> tuple[float, int]:
+def multi_scale_cost(
+    points: Array, R: Array, x: Array, threshold2: Array, limit: float
+) -> tuple[float, int]:
     """Sum over matches and scales of ``min(r^2 / T^2, 1)``, and the inliers of the middle scale.
 
     `points` (6, N): ``x_1, y_1, x_2, y_2`` of the derotated rays at z = 1, ``tau_1, tau_2`` [s];
@@ -95,10 +96,10 @@ def multi_scale_cost(points: Array, R: Array, x: Array, threshold2: Array,
 class Sampling(NamedTuple):
     """What is sampled, how hypotheses are ranked (`multi_scale_cost`), and when sampling stops."""
 
-    points: Array   # (6, N)
-    order: NDArray[np.int64]   # (M,) usable matches, best first
-    threshold2: Array   # (3,)
-    confidence: float   # probability of a sample without outliers
+    points: Array  # (6, N)
+    order: NDArray[np.int64]  # (M,) usable matches, best first
+    threshold2: Array  # (3,)
+    confidence: float  # probability of a sample without outliers
     max_samples: int
 
 
@@ -121,8 +122,9 @@ def _random(state: NDArray[np.uint64]) -> np.uint64:
 
 
 @kernel
-def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
-         state: NDArray[np.uint64]) -> None:
+def draw(
+    order: NDArray[np.int64], head: int, sample: NDArray[np.int64], state: NDArray[np.uint64]
+) -> None:
     """Fill `sample` with distinct entries of ``order[:head]``."""
     for k in range(sample.shape[0]):
         while True:
@@ -181,9 +183,18 @@ def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
 
 
 @kernel
-def sample_hypotheses(solver: int, size: int, sampling: Sampling, known: Knowledge, drawn: int,
-                      block: int, best_inliers: int, out: Solutions, pool: Pool,
-                      seed: NDArray[np.uint64]) -> tuple[int, int]:
+def sample_hypotheses(
+    solver: int,
+    size: int,
+    sampling: Sampling,
+    known: Knowledge,
+    drawn: int,
+    block: int,
+    best_inliers: int,
+    out: Solutions,
+    pool: Pool,
+    seed: NDArray[np.uint64],
+) -> tuple[int, int]:
     """Draw samples for one solver and fill the pool, in place.
 
     `solver`, `size`: address of its kernel, and matches of a sample. `drawn`, `block`: samples
@@ -214,8 +225,9 @@ def sample_hypotheses(solver: int, size: int, sampling: Sampling, known: Knowled
         count = common.solve_at(solver, sample, known, out)
         for k in range(count):
             limit = pool.cost.max()
-            cost, inliers = multi_scale_cost(sampling.points, out.R[k], out.x[k],
-                                             sampling.threshold2, limit)
+            cost, inliers = multi_scale_cost(
+                sampling.points, out.R[k], out.x[k], sampling.threshold2, limit
+            )
             if cost < limit:
                 _offer(out.R[k], out.x[k], cost, pool)
                 if cost < best:
@@ -275,9 +287,15 @@ MODES = {
 }
 
 
-def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
-                    order: NDArray[np.int64], seed: NDArray[np.uint64],
-                    enough: float, deadline: float) -> tuple[Solutions, int, bool]:
+def draw_hypotheses(
+    problem: TwoViewProblem,
+    mode: SolverMode,
+    config: EstimatorConfig,
+    order: NDArray[np.int64],
+    seed: NDArray[np.uint64],
+    enough: float,
+    deadline: float,
+) -> tuple[Solutions, int, bool]:
     """Sample the solvers of a mode until a share `enough` of the matches are inliers of one.
 
     `order` (M,): usable matches, best first. `seed` (1,): state of the random number generator,
@@ -289,39 +307,58 @@ def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: Estimator
     gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
     has_gravity = gravity1 is not None and gravity2 is not None
     if gravity1 is not None and gravity2 is not None:
-        known = known._replace(align1=common.gravity_alignment(gravity1),
-                               align2=common.gravity_alignment(gravity2))
+        known = known._replace(
+            align1=common.gravity_alignment(gravity1), align2=common.gravity_alignment(gravity2)
+        )
     if problem.rotation is not None:
         known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
-    sampling = Sampling(problem.points, order, (config.threshold * SCALES / problem.focal)**2,
-                        config.confidence, config.max_iterations)
+    sampling = Sampling(
+        problem.points,
+        order,
+        (config.threshold * SCALES / problem.focal) ** 2,
+        config.confidence,
+        config.max_iterations,
+    )
     # All addresses first, so that the first pair compiles the solvers of later pairs, too.
-    able = [(solver, solver.address) for solver in mode.solvers
-            if (known.predicted or not solver.needs_rotation)
-            and (has_gravity or not solver.needs_gravity)]
-    pool = Pool(np.zeros((POOL_SIZE, 3, 3)), np.zeros((POOL_SIZE, 9)),
-                np.full(POOL_SIZE, np.inf))
+    able = [
+        (solver, solver.address)
+        for solver in mode.solvers
+        if (known.predicted or not solver.needs_rotation)
+        and (has_gravity or not solver.needs_gravity)
+    ]
+    pool = Pool(np.zeros((POOL_SIZE, 3, 3)), np.zeros((POOL_SIZE, 9)), np.full(POOL_SIZE, np.inf))
     block = config.max_iterations if math.isinf(deadline) else _TIMED_BLOCK
     samples = inliers = 0
     solvers_skipped = False
     for solver, address in able:
-        solvers_skipped = (inliers > enough * len(order)
-                           or (samples > 0 and time.perf_counter() >= deadline))
+        solvers_skipped = inliers > enough * len(order) or (
+            samples > 0 and time.perf_counter() >= deadline
+        )
         if solvers_skipped:
             break
         out = common.empty_solutions(solver.most_solutions)
         if samples > 0 and known.predicted:
             sampling = sampling._replace(
-                max_samples=min(config.max_iterations, _MOST_WITHOUT_GYRO))
+                max_samples=min(config.max_iterations, _MOST_WITHOUT_GYRO)
+            )
         drawn, new = 0, block
         while new == block:
             before = drawn
             drawn, inliers = sample_hypotheses(
-                address, solver.sample_size, sampling, known, drawn, block, inliers, out, pool,
-                seed)
+                address,
+                solver.sample_size,
+                sampling,
+                known,
+                drawn,
+                block,
+                inliers,
+                out,
+                pool,
+                seed,
+            )
             new = drawn - before if time.perf_counter() < deadline else 0
         samples += drawn
-    found = np.argsort(pool.cost)[:np.isfinite(pool.cost).sum()]
+    found = np.argsort(pool.cost)[: np.isfinite(pool.cost).sum()]
     return Solutions(pool.R[found], pool.x[found]), samples, solvers_skipped
 
 
@@ -344,8 +381,9 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
 
 
 @kernel
-def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: float,
-             threshold: float) -> tuple[TwoViewState, bool]:
+def optimise(
+    matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: float, threshold: float
+) -> tuple[TwoViewState, bool]:
     """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.
 
     The threshold shrinks from round to round, and each round keeps the better half. `sigma`,
@@ -354,7 +392,7 @@ def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: f
     """
     # No test of depths before the sign is known: no parallax is above this noise.
     unsure = RayMatches(matches.observations, matches.valid, 1e9)
-    states, r = [], []   # that remain, and their residuals
+    states, r = [], []  # that remain, and their residuals
     for k in range(len(hypotheses.R)):
         state = priors.hypothesis_state(hypotheses.R[k], hypotheses.x[k])
         r.append(sampson.residuals(matches.observations, state))
@@ -370,13 +408,19 @@ def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: f
             use = sampson.within(r[k], matches, states[k], bound)
             if use.sum() < 6:
                 continue
-            costs[k] = (_truncated_cost(r[k], matches.valid, bound, noise)
-                        + priors.prior_cost(states[k], prior))
-            state = gauss_newton(FitMatches(matches.observations, use.astype(np.float64), noise),
-                                 states[k], prior, int(STEPS))
+            costs[k] = _truncated_cost(r[k], matches.valid, bound, noise) + priors.prior_cost(
+                states[k], prior
+            )
+            state = gauss_newton(
+                FitMatches(matches.observations, use.astype(np.float64), noise),
+                states[k],
+                prior,
+                int(STEPS),
+            )
             errors = sampson.residuals(matches.observations, state)
-            cost = (_truncated_cost(errors, matches.valid, bound, noise)
-                    + priors.prior_cost(state, prior))
+            cost = _truncated_cost(errors, matches.valid, bound, noise) + priors.prior_cost(
+                state, prior
+            )
             if cost < costs[k]:
                 states[k], r[k], costs[k] = state, errors, cost
         good = (costs < math.inf).sum()
@@ -395,18 +439,22 @@ def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: f
 # Rounds of its fit, Gauss-Newton steps and weights of each (Cauchy, in sigmas), and the round by
 # which it must be the likelier one: it rarely is if the pose is right.
 _FREE_ROUNDS, _FREE_STEPS, _FREE_SIGMAS, _PROMISING = 6, 2, 2.4, 2
-_LEAST_SCALE = 0.05   # of residuals [px]
+_LEAST_SCALE = 0.05  # of residuals [px]
 
 
 @kernel
 def _unlikelihood(r: Array) -> float:
     """Negative log-likelihood of residuals (N,), Cauchy about zero with their median as scale."""
     scale = max(so3.median(np.abs(r)), _LEAST_SCALE)
-    return len(r) * math.log(scale) + np.log(1.0 + (r / scale)**2).sum()
+    return len(r) * math.log(scale) + np.log(1.0 + (r / scale) ** 2).sum()
 
 
-def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, focal: float,
-                      ) -> tuple[float, Array]:
+def gain_without_gyro(
+    matches: RayMatches,
+    state: TwoViewState,
+    prior: Priors,
+    focal: float,
+) -> tuple[float, Array]:
     """Log-likelihood that all matches gain by a free rotation, and that rotation (3, 3).
 
     Negative if the pose `state`, whose `prior` is the gyro's rotation, is the likelier one.
@@ -428,7 +476,7 @@ def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, f
         if k == _FREE_ROUNDS or (k == _PROMISING and gain < 0.0):
             break
         sigma = max(1.4826 * so3.median(np.abs(r)), _LEAST_SCALE)
-        weights = 1.0 / (1.0 + (r / (_FREE_SIGMAS * sigma))**2)
+        weights = 1.0 / (1.0 + (r / (_FREE_SIGMAS * sigma)) ** 2)
         state = gauss_newton(FitMatches(observations, weights, sigma), state, free, _FREE_STEPS)
     return gain, state.R
 
@@ -444,6 +492,7 @@ def translation_direction(observations: Array, R: Array) -> Array:
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------
 
+
 @kernel
 def correlation(observations: Array, use: NDArray[np.bool_], first: int, second: int) -> Array:
     """``sum a b^T`` (3, 3) over the matches in `use` of two of their vectors, by column."""
@@ -456,10 +505,11 @@ def correlation(observations: Array, use: NDArray[np.bool_], first: int, second:
     return out
 
 
-def distinct_directions(observations: Array, use: NDArray[np.bool_], first: int,
-                        cell: float) -> int:
+def distinct_directions(
+    observations: Array, use: NDArray[np.bool_], first: int, cell: float
+) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
-    x, y = np.round(observations[use, first:first + 2].T / cell)
+    x, y = np.round(observations[use, first : first + 2].T / cell)
     return len(set((x + 1e6 * y).tolist()))
 
 

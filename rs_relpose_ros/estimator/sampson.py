@@ -52,8 +52,9 @@ def _rotation_series(rate: Array, R: Array) -> Array:
     for j in range(3):
         out[0, 0, j], out[0, 1, j], out[0, 2, j] = R[0, j], R[1, j], R[2, j]
         for k in range(1, 3):
-            x, y, z = _cross(rate[0], rate[1], rate[2], out[k - 1, 0, j], out[k - 1, 1, j],
-                             out[k - 1, 2, j])
+            x, y, z = _cross(
+                rate[0], rate[1], rate[2], out[k - 1, 0, j], out[k - 1, 1, j], out[k - 1, 2, j]
+            )
             out[k, 0, j], out[k, 1, j], out[k, 2, j] = x / k, y / k, z / k
     return out
 
@@ -71,7 +72,8 @@ def _rotated(series, tau, x, y, z):  # type: ignore[no-untyped-def]
         + (series[0, 1, 2] + tau * series[1, 1, 2] + s * series[2, 1, 2]) * z,
         (series[0, 2, 0] + tau * series[1, 2, 0] + s * series[2, 2, 0]) * x
         + (series[0, 2, 1] + tau * series[1, 2, 1] + s * series[2, 2, 1]) * y
-        + (series[0, 2, 2] + tau * series[1, 2, 2] + s * series[2, 2, 2]) * z)
+        + (series[0, 2, 2] + tau * series[1, 2, 2] + s * series[2, 2, 2]) * z,
+    )
 
 
 @kernel
@@ -125,10 +127,14 @@ def _residual(o, i, baselines, series1, series2):  # type: ignore[no-untyped-def
     r = e * c0
     c = -r * c0 * c0
     c1, c2, c3, c4 = c * q1, c * q2, c * q3, c * q4
-    return (r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz),
-            (c0 * fx + c1 * ux + c2 * vx, c0 * fy + c1 * uy + c2 * vy,
-             c0 * fz + c1 * uz + c2 * vz),
-            (c3 * hux + c4 * hvx, c3 * huy + c4 * hvy, c3 * huz + c4 * hvz))
+    return (
+        r,
+        (bx, by, bz),
+        (fx, fy, fz),
+        (hx, hy, hz),
+        (c0 * fx + c1 * ux + c2 * vx, c0 * fy + c1 * uy + c2 * vy, c0 * fz + c1 * uz + c2 * vz),
+        (c3 * hux + c4 * hvx, c3 * huy + c4 * hvy, c3 * huz + c4 * hvz),
+    )
 
 
 @inlined_kernel
@@ -136,7 +142,8 @@ def _linearise(o, baselines, series1, series2, basis, rows):  # type: ignore[no-
     """Derivatives of a block in `rows` (18, BLOCK), residuals last, times the weights' roots."""
     for i in range(BLOCK):
         r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz), (px, py, pz), (jx, jy, jz) = _residual(
-            o, i, baselines, series1, series2)
+            o, i, baselines, series1, series2
+        )
         # by b: p' x h + f_1 x h'
         nx, ny, nz = _cross(px, py, pz, hx, hy, hz)
         mx, my, mz = _cross(fx, fy, fz, jx, jy, jz)
@@ -204,8 +211,9 @@ def jacobian(observations: Array, state: TwoViewState) -> Array:
 
 
 @kernel
-def normal_equations(observations: Array, weights: Array,
-                     state: TwoViewState) -> tuple[Array, Array, float]:
+def normal_equations(
+    observations: Array, weights: Array, state: TwoViewState
+) -> tuple[Array, Array, float]:
     """``J^T W J`` (17, 17), ``J^T W r`` (17,) and ``r^T W r`` with the weights (N,) of matches."""
     baselines, series1, series2 = _coefficients(state)
     basis = so3.tangent_basis(state.t)
@@ -225,8 +233,9 @@ def normal_equations(observations: Array, weights: Array,
 
 
 @kernel
-def triangulated(observations: Array, i: int,
-                 state: TwoViewState) -> tuple[float, float, float, float]:
+def triangulated(
+    observations: Array, i: int, state: TwoViewState
+) -> tuple[float, float, float, float]:
     """Depths of match i along both rays [baselines], its parallax [rad] and length of baseline.
 
     ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1, each
@@ -235,16 +244,23 @@ def triangulated(observations: Array, i: int,
     o = observations[i]
     tau1, tau2 = o[18], o[19]
     t, d1, d2 = state.t, state.d1, state.d2
-    b = (t[0] - tau1 * d1[0] + tau2 * d2[0], t[1] - tau1 * d1[1] + tau2 * d2[1],
-         t[2] - tau1 * d1[2] + tau2 * d2[2])
+    b = (
+        t[0] - tau1 * d1[0] + tau2 * d2[0],
+        t[1] - tau1 * d1[1] + tau2 * d2[1],
+        t[2] - tau1 * d1[2] + tau2 * d2[2],
+    )
     f, h = o[0:3], so3.rotated(state.R, o[9:12])
     n = so3.cross(f, h)
     n2 = so3.dot(n, n)
     baseline = so3.norm(b)
     if n2 < 1e-18:
         return math.nan, math.nan, 0.0, baseline
-    return (so3.dot(so3.cross(b, h), n) / n2, so3.dot(so3.cross(b, f), n) / n2, math.sqrt(n2),
-            baseline)
+    return (
+        so3.dot(so3.cross(b, h), n) / n2,
+        so3.dot(so3.cross(b, f), n) / n2,
+        math.sqrt(n2),
+        baseline,
+    )
 
 
 # -- Inliers of a state: by residuals and by depths -----------------------------------------------
@@ -264,9 +280,9 @@ MIN_DEPTH_SPREAD = 0.25
 class RayMatches(NamedTuple):
     """All matches of a pair."""
 
-    observations: Array   # (N, 20) rows as above
-    valid: Flags   # (N,) those with finite rays
-    angle_sigma: float   # noise of a ray [rad]
+    observations: Array  # (N, 20) rows as above
+    valid: Flags  # (N,) those with finite rays
+    angle_sigma: float  # noise of a ray [rad]
 
 
 @kernel
@@ -292,8 +308,10 @@ def count_behind(matches: RayMatches, use: Flags, state: TwoViewState) -> int:
     for i in range(len(use)):
         if use[i]:
             depth1, depth2, parallax, _ = triangulated(matches.observations, i, state)
-            if (parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
-                    and min(depth1, depth2) <= 0.0):
+            if (
+                parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
+                and min(depth1, depth2) <= 0.0
+            ):
                 count += 1
     return count
 
@@ -326,9 +344,11 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
     # Near and far side separately: a scene is denser far away, and its few near points, which
     # resemble outliers, determine most of the translation.
     known, last = known[:count], count - 1
-    near, centre, far = (math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last))),
-                         math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last))),
-                         math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last))))
+    near, centre, far = (
+        math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last))),
+        math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last))),
+        math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last))),
+    )
     lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
     highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
     for i in range(n):
@@ -384,8 +404,12 @@ def noise_mixture(r: Array, use: Flags, configured: float) -> tuple[Array, float
                 r2 = r[i] * r[i] / variance
                 if not r2 < LARGEST:
                     r2 = LARGEST
-                ratio = (share / (1.0 - share) / WORSE
-                         * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE))))
+                ratio = (
+                    share
+                    / (1.0 - share)
+                    / WORSE
+                    * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE)))
+                )
                 p = ratio / (1.0 + ratio)
                 worse += p
                 weights[i] = 1.0 - p * (1.0 - 1.0 / (WORSE * WORSE))

@@ -39,24 +39,31 @@ LEAST_EVIDENCE = 6.0
 class Scales(NamedTuple):
     """Grid of scales of the velocities (`priors`)."""
 
-    centres: Array   # ``log b`` of each, or the mean of its prior
-    log_weights: Array   # logarithms of their prior probabilities, up to a constant
+    centres: Array  # ``log b`` of each, or the mean of its prior
+    log_weights: Array  # logarithms of their prior probabilities, up to a constant
 
 
 class Refined(NamedTuple):
     """A refined state, its matches and its covariance."""
 
     state: TwoViewState
-    inliers: Flags   # (N,) the matches of the last fits
-    log_scale: float   # log b of the largest evidence, or the mean if it is unknown
-    velocity_sigma: float   # of the velocities' prior [baselines per second]
-    sigma: float   # noise of a match in the fits [px]
-    covariance: Array   # (n, n) of the local parameters, within the fits and between them
+    inliers: Flags  # (N,) the matches of the last fits
+    log_scale: float  # log b of the largest evidence, or the mean if it is unknown
+    velocity_sigma: float  # of the velocities' prior [baselines per second]
+    sigma: float  # noise of a match in the fits [px]
+    covariance: Array  # (n, n) of the local parameters, within the fits and between them
 
 
 @kernel
-def fit_with_evidence(matches: RayMatches, start: TwoViewState, prior: Priors, sigma: float,
-                      threshold: float, scales: Scales, gyro_error: Array) -> Refined:
+def fit_with_evidence(
+    matches: RayMatches,
+    start: TwoViewState,
+    prior: Priors,
+    sigma: float,
+    threshold: float,
+    scales: Scales,
+    gyro_error: Array,
+) -> Refined:
     """Select inliers and fit repeatedly; average over the scales of the velocities at the end.
 
     The state is the mean over the scales, weighted by their evidence. `sigma`, `threshold`:
@@ -73,7 +80,7 @@ def fit_with_evidence(matches: RayMatches, start: TwoViewState, prior: Priors, s
     best = int(np.argmin(np.abs(scales.centres - prior.velocity.log_scale)))
     for attempt in range(ROUNDS):
         low, high = 0, size
-        if attempt > 0:   # the best scale changes little with the inliers of the first round
+        if attempt > 0:  # the best scale changes little with the inliers of the first round
             low, high = max(best - 1, 0), min(best + 2, size)
         # From the best scale down and from it up, each fit from its neighbour's optimum.
         data = linearised(used, state)
@@ -83,8 +90,17 @@ def fit_with_evidence(matches: RayMatches, start: TwoViewState, prior: Priors, s
             if k == best + 1:
                 state, data = upwards, upwards_data
             state, log_scale, data, _, evidences[k] = _candidate(
-                matches, used, state, data, prior, scales, k, scales.centres[k], threshold,
-                int(ITERATIONS))
+                matches,
+                used,
+                state,
+                data,
+                prior,
+                scales,
+                k,
+                scales.centres[k],
+                threshold,
+                int(ITERATIONS),
+            )
             if k == best:
                 upwards, upwards_data = state, data
             so3.copy_vector(priors.step_between(start, state), steps[k])
@@ -99,13 +115,15 @@ def fit_with_evidence(matches: RayMatches, start: TwoViewState, prior: Priors, s
         used = _selected(matches, state, reach, sigma)
         if ((used.weights > 0.0) == chosen_from).all():
             break
-    return _average(matches, used, start, steps, lacking < LEAST_EVIDENCE, prior, scales,
-                    threshold, gyro_error)
+    return _average(
+        matches, used, start, steps, lacking < LEAST_EVIDENCE, prior, scales, threshold, gyro_error
+    )
 
 
 @small_kernel
-def _selected(matches: RayMatches, state: TwoViewState, threshold: float,
-              prior_sigma: float) -> FitMatches:
+def _selected(
+    matches: RayMatches, state: TwoViewState, threshold: float, prior_sigma: float
+) -> FitMatches:
     """Inliers of a state, with their noise."""
     r = sampson.residuals(matches.observations, state)
     inliers = sampson.within(r, matches, state, threshold)
@@ -131,29 +149,51 @@ def _known_velocities(data: DataTerm, state: TwoViewState, prior: Priors) -> flo
 
 
 @kernel
-def _candidate(matches: RayMatches, used: FitMatches, start: TwoViewState, data: DataTerm,
-               prior: Priors, scales: Scales, k: int, log_scale: float, threshold: float,
-               iterations: int) -> tuple[TwoViewState, float, DataTerm, Array, float]:
+def _candidate(
+    matches: RayMatches,
+    used: FitMatches,
+    start: TwoViewState,
+    data: DataTerm,
+    prior: Priors,
+    scales: Scales,
+    k: int,
+    log_scale: float,
+    threshold: float,
+    iterations: int,
+) -> tuple[TwoViewState, float, DataTerm, Array, float]:
     """Fit about scale k, from `log_scale`: state, log b, data term, Hessian and log-evidence."""
     prior = priors.at_scale(prior, log_scale, scales.centres[k], 0.0)
     if prior.velocity.weight > 0.0:
-        prior = priors.at_scale(prior, log_scale, scales.centres[k],
-                                _known_velocities(data, start, prior))
+        prior = priors.at_scale(
+            prior, log_scale, scales.centres[k], _known_velocities(data, start, prior)
+        )
     state, log_scale, data, cost, hessian = fit(used, start, data, prior, iterations)
     cost += 2.0 * prior.velocity.freedom * log_scale
     # Velocities that move the camera by more than the baseline within a frame fit any residual,
     # with points behind the cameras: those count as outliers.
     behind = sampson.count_behind(matches, used.weights > 0.0, state)
     cost += behind * (threshold / used.sigma) ** 2
-    evidence = (-0.5 * cost - 0.5 * priors.log_determinant(hessian) + 6.0 * log_scale
-                + scales.log_weights[k])
+    evidence = (
+        -0.5 * cost
+        - 0.5 * priors.log_determinant(hessian)
+        + 6.0 * log_scale
+        + scales.log_weights[k]
+    )
     return state, log_scale, data, hessian, evidence
 
 
 @small_kernel
-def _average(matches: RayMatches, used: FitMatches, start: TwoViewState, steps: Array,
-             likely: Flags, prior: Priors, scales: Scales, threshold: float,
-             gyro_error: Array) -> Refined:
+def _average(
+    matches: RayMatches,
+    used: FitMatches,
+    start: TwoViewState,
+    steps: Array,
+    likely: Flags,
+    prior: Priors,
+    scales: Scales,
+    threshold: float,
+    gyro_error: Array,
+) -> Refined:
     """Mean state over the scales, its covariance, and the scale of the largest evidence.
 
     If the data do not determine the scale, one of them alone is overconfident. The fits of the
@@ -168,8 +208,17 @@ def _average(matches: RayMatches, used: FitMatches, start: TwoViewState, steps: 
             own = priors.moved(start, steps[k])
             log_scale = steps[k, SCALE] if n > SCALE else scales.centres[k]
             state, log_scale, data, hessian, evidences[k] = _candidate(
-                matches, used, own, linearised(used, own), prior, scales, k, log_scale,
-                threshold, int(LAST_ITERATIONS))
+                matches,
+                used,
+                own,
+                linearised(used, own),
+                prior,
+                scales,
+                k,
+                log_scale,
+                threshold,
+                int(LAST_ITERATIONS),
+            )
             so3.copy_vector(priors.step_between(start, state), steps[k])
             if n > SCALE:
                 steps[k, SCALE] = log_scale
@@ -205,9 +254,14 @@ def _average(matches: RayMatches, used: FitMatches, start: TwoViewState, steps: 
         log_scale = steps[best, SCALE] + mean[SCALE]
     # Root mean square over the six velocities.
     sigma = math.sqrt(np.trace(priors.inverse(prior.velocity.information)) / 6.0)
-    return Refined(priors.moved(origin, mean), used.weights > 0.0, log_scale,
-                   sigma * math.exp(-log_scale), used.sigma,
-                   scaled_like(within_fits, fitted, robust) + between_fits)
+    return Refined(
+        priors.moved(origin, mean),
+        used.weights > 0.0,
+        log_scale,
+        sigma * math.exp(-log_scale),
+        used.sigma,
+        scaled_like(within_fits, fitted, robust) + between_fits,
+    )
 
 
 # -- Prior of the linear velocities by time, accelerometer and carrier ----------------------------
@@ -240,8 +294,9 @@ TIMELESS = Scales(np.asarray(-np.log(GRID)), np.asarray(-SMALL_IS_LIKELIER * np.
 AT_ZERO = Scales(np.array([0.5 * math.log(priors.PINNED)]), np.zeros(1))
 
 
-def expected_velocities(problem: TwoViewProblem, motion: str, interval: float,
-                        inertial: InertialMotion | None) -> tuple[VelocityPrior, Scales]:
+def expected_velocities(
+    problem: TwoViewProblem, motion: str, interval: float, inertial: InertialMotion | None
+) -> tuple[VelocityPrior, Scales]:
     """Prior of the velocities at the middle rows, and the grid of their scales.
 
     `motion`: carrier of the camera, of `MOTIONS`; `interval`: between the frames [s]; `inertial`:
@@ -259,8 +314,14 @@ def expected_velocities(problem: TwoViewProblem, motion: str, interval: float,
     step = (highest - lowest) / SCALE_COUNT
     centres = np.array([lowest + step * (0.5 + k) for k in range(SCALE_COUNT)])
     prior = VelocityPrior(
-        1.0 / interval, to_velocities @ expected, priors.inverse(covariance),
-        float(centres[SCALE_COUNT // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
+        1.0 / interval,
+        to_velocities @ expected,
+        priors.inverse(covariance),
+        float(centres[SCALE_COUNT // 2]),
+        0.0,
+        (WIDTH * step) ** -2,
+        0.0,
+    )
     return prior, Scales(centres, np.zeros(SCALE_COUNT))
 
 
@@ -319,34 +380,44 @@ _BASELINES = 14
 class InertialEvidence(NamedTuple):
     """Logarithms of the Bayes factors of one pair, by its images."""
 
-    configured: float   # of the measured acceleration
-    opposite: float   # of the opposite one, as of an accelerometer with the other sign
+    configured: float  # of the measured acceleration
+    opposite: float  # of the opposite one, as of an accelerometer with the other sign
 
 
-def inertial_evidence(problem: TwoViewProblem, images: ImageInformation, motion: str,
-                      interval: float, measured: VelocityPrior) -> InertialEvidence | None:
+def inertial_evidence(
+    problem: TwoViewProblem,
+    images: ImageInformation,
+    motion: str,
+    interval: float,
+    measured: VelocityPrior,
+) -> InertialEvidence | None:
     """Evidence of a pair's images for its acceleration; None if they contain none.
 
     `problem`: with the gyro's rotation; its matches are not used. `images`: of the pose, estimated
     with or without that acceleration. `measured`: prior by the acceleration
     (`expected_velocities`); the opposite one has the (small) part of the lever arm reversed, too.
     """
-    if len(images.gradient) == ROTATION or problem.rotation is None \
-            or problem.rotation_information is None:
+    if (
+        len(images.gradient) == ROTATION
+        or problem.rotation is None
+        or problem.rotation_information is None
+    ):
         return None
     H, g = _without_rotation(images, problem.rotation, problem.rotation_information)
     unknown, _ = expected_velocities(problem, motion, interval, None)
     log_b = np.linspace(*span_of_scales(motion, interval), _BASELINES)
     configured, opposite, nothing = (
         _log_evidence(H, g, images.t, images.velocities, prior, log_b)
-        for prior in (measured, measured._replace(offset=-measured.offset), unknown))
+        for prior in (measured, measured._replace(offset=-measured.offset), unknown)
+    )
     if not math.isfinite(configured + opposite - nothing):
         return None
     return InertialEvidence(configured - nothing, opposite - nothing)
 
 
-def _without_rotation(images: ImageInformation, rotation: Array,
-                      information: Array) -> tuple[Array, Array]:
+def _without_rotation(
+    images: ImageInformation, rotation: Array, information: Array
+) -> tuple[Array, Array]:
     """Information (8, 8) and gradient (8,) of s and the velocities, the rotation by the gyro."""
     k, H, g = ROTATION, images.information.copy(), images.gradient.copy()
     theta = so3.log_so3(np.ascontiguousarray(rotation @ images.R.T))
@@ -358,8 +429,9 @@ def _without_rotation(images: ImageInformation, rotation: Array,
 
 
 @kernel
-def _log_evidence(H: Array, g: Array, t: Array, velocities: Array, prior: VelocityPrior,
-                  log_b: Array) -> float:
+def _log_evidence(
+    H: Array, g: Array, t: Array, velocities: Array, prior: VelocityPrior, log_b: Array
+) -> float:
     """Log of Z for the acceleration of `prior`, averaged over ``log b`` (K,)."""
     basis, W = so3.tangent_basis(t), prior.information
     J, away = np.zeros((6, 8)), np.empty(6)
@@ -374,7 +446,12 @@ def _log_evidence(H: Array, g: Array, t: Array, velocities: Array, prior: Veloci
         b = math.exp(log_b[k])
         u = b * away + prior.offset
         A, q = H + b * b * JWJ, g + b * (WJ.T @ u)
-        values[k] = (6.0 * log_b[k] + of_prior - 0.5 * priors.log_determinant(A)
-                     + 0.5 * (q * (priors.inverse(A) @ q)).sum() - 0.5 * (u * (W @ u)).sum())
+        values[k] = (
+            6.0 * log_b[k]
+            + of_prior
+            - 0.5 * priors.log_determinant(A)
+            + 0.5 * (q * (priors.inverse(A) @ q)).sum()
+            - 0.5 * (u * (W @ u)).sum()
+        )
     largest = values.max()
     return largest + math.log(np.exp(values - largest).mean())

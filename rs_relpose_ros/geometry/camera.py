@@ -30,6 +30,7 @@ _FARTHEST_PIXEL = 1e9
 # To add one: write its kernel and its row of `DISTORTION_MODELS`; camera, calibration and checks
 # use these only.
 
+
 @kernel
 def distort_equidistant(x: float, y: float, k: Array, out: Array) -> None:
     """OpenCV's fisheye model: the angle off the axis becomes the radius; `k` (4,)."""
@@ -42,8 +43,9 @@ def distort_equidistant(x: float, y: float, k: Array, out: Array) -> None:
         scale, slope = 1.0, 0.0
     else:
         scale = angle / r
-        by_theta = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (
-            7.0 * k[2] + t2 * 9.0 * k[3])))
+        by_theta = 1.0 + t2 * (
+            3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3]))
+        )
         # (d scale / d r) / r
         slope = (by_theta / (1.0 + r2) - scale) / r2
     out[0], out[1] = scale * x, scale * y
@@ -68,8 +70,10 @@ def distort_rational(x: float, y: float, k: Array, out: Array) -> None:
     below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
     radial = above / below
     # d radial / d(r^2)
-    slope = ((k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4]))
-             - radial * (k[5] + r2 * (2.0 * k[6] + r2 * 3.0 * k[7]))) / below
+    slope = (
+        (k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4]))
+        - radial * (k[5] + r2 * (2.0 * k[6] + r2 * 3.0 * k[7]))
+    ) / below
     p1, p2 = k[2], k[3]
     out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (k[8] + r2 * k[9])
     out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (k[10] + r2 * k[11])
@@ -90,32 +94,37 @@ distort_at = _DISTORT.call
 class DistortionModel:
     """Map of a lens on points of the plane z = 1."""
 
-    name: str   # as in sensor_msgs/CameraInfo (REP-104)
-    coefficient_counts: tuple[int, ...]   # legal ones, in the order of CameraInfo and OpenCV
-    size: int   # number of coefficients of `distort`; those not given are zero
+    name: str  # as in sensor_msgs/CameraInfo (REP-104)
+    coefficient_counts: tuple[int, ...]  # legal ones, in the order of CameraInfo and OpenCV
+    size: int  # number of coefficients of `distort`; those not given are zero
     # Kernel distort(x, y, k, out): `out` (6,) = x', y', and d(x', y')/d(x, y) row by row.
     distort: Callable[[float, float, Array, Array], None]
     # Of the undistorted points (N, 2), from the distorted ones.
     first_guess: Callable[[Array], Array] = np.copy
-    is_pinhole_at_zero: bool = True   # whether coefficients of zero distort nothing
+    is_pinhole_at_zero: bool = True  # whether coefficients of zero distort nothing
 
     def compiled(self, coefficients: tuple[float, ...]) -> tuple[int, Array]:
         """Address of the compiled kernel `distort`, and its coefficients (size,)."""
         k = np.zeros(self.size)
-        k[:len(coefficients)] = coefficients
+        k[: len(coefficients)] = coefficients
         return _DISTORT.address(self.distort), k
 
 
-DISTORTION_MODELS = {model.name: model for model in (
-    DistortionModel('plumb_bob', (0, 4, 5, 8), 12, distort_rational),
-    DistortionModel('rational_polynomial', (8, 12), 12, distort_rational),
-    DistortionModel('equidistant', (4,), 4, distort_equidistant, ideal_fisheye,
-                    is_pinhole_at_zero=False),
-)}
+DISTORTION_MODELS = {
+    model.name: model
+    for model in (
+        DistortionModel('plumb_bob', (0, 4, 5, 8), 12, distort_rational),
+        DistortionModel('rational_polynomial', (8, 12), 12, distort_rational),
+        DistortionModel(
+            'equidistant', (4,), 4, distort_equidistant, ideal_fisheye, is_pinhole_at_zero=False
+        ),
+    )
+}
 
 
 # ``cv2.undistortPoints`` stops after five fixed-point steps, with pixels of error on strong
 # distortion, and the calls that iterate longer differ between OpenCV 4 and 5.
+
 
 @kernel
 def project_points(points: Array, distort: int, k: Array) -> Array:
@@ -137,8 +146,9 @@ def project_points(points: Array, distort: int, k: Array) -> Array:
 
 
 @kernel
-def undistort_points(points: Array, first_guesses: Array, distort: int,
-                     k: Array) -> tuple[Array, Array]:
+def undistort_points(
+    points: Array, first_guesses: Array, distort: int, k: Array
+) -> tuple[Array, Array]:
     """Undistorted normalised points (N, 2) and their derivatives (N, 2, 2) by the distorted ones.
 
     NaN if there is no inverse. A root beyond the turning point of the polynomial is a mirror image
@@ -214,13 +224,18 @@ class RollingShutterCamera:
     def __post_init__(self) -> None:
         for name in ('width', 'height'):
             validate.number(name, getattr(self, name), 1, _LARGEST_IMAGE, 'px', whole=True)
-        for name, least in (('fx', 1.0 / _FARTHEST_PIXEL), ('fy', 1.0 / _FARTHEST_PIXEL),
-                            ('cx', -_FARTHEST_PIXEL), ('cy', -_FARTHEST_PIXEL)):
+        for name, least in (
+            ('fx', 1.0 / _FARTHEST_PIXEL),
+            ('fy', 1.0 / _FARTHEST_PIXEL),
+            ('cx', -_FARTHEST_PIXEL),
+            ('cy', -_FARTHEST_PIXEL),
+        ):
             validate.number(name, getattr(self, name), least, _FARTHEST_PIXEL, 'px')
         if not 0.0 <= self.readout_time < 1.0:
             raise InputError(
                 'readout_time must be in [0, 1) s (height times line delay; 0 for a global '
-                f'shutter), got {self.readout_time!r}')
+                f'shutter), got {self.readout_time!r}'
+            )
         validate.choice('readout_direction', self.readout_direction, READOUT_DIRECTIONS)
         validate.choice('reference_row', self.reference_row, REFERENCE_ROWS)
         validate.choice('distortion_model', self.distortion_model, DISTORTION_MODELS)
@@ -229,7 +244,8 @@ class RollingShutterCamera:
         if coefficients and len(coefficients) not in legal:
             raise InputError(
                 f'distortion of model {self.distortion_model!r} must have one of {legal} '
-                f'coefficients, got {len(coefficients)}')
+                f'coefficients, got {len(coefficients)}'
+            )
         object.__setattr__(self, 'distortion', coefficients)
 
     @property
@@ -242,7 +258,8 @@ class RollingShutterCamera:
     def reference_row_index(self) -> float:
         """Row from which row times count: 0, (height - 1) / 2 or height - 1."""
         return {'first': 0.0, 'middle': (self.height - 1) / 2, 'last': self.height - 1.0}[
-            self.reference_row]
+            self.reference_row
+        ]
 
     def row_times(self, rows: ArrayLike) -> Array:
         """Row times ``tau = (row - reference row) * line_delay`` [s] of raw, distorted rows."""
@@ -280,9 +297,14 @@ class RollingShutterCamera:
         `rows` (N,): first guesses. `rotations` (K, 3, 3): from the frame of the rays to that of
         the camera, at K rows spread evenly from the first to the last one.
         """
-        return project_rotating(rays, rows, rotations, self.height,
-                                (self.fx, self.fy, self.cx, self.cy),
-                                *self._lens.compiled(self.distortion))
+        return project_rotating(
+            rays,
+            rows,
+            rotations,
+            self.height,
+            (self.fx, self.fy, self.cx, self.cy),
+            *self._lens.compiled(self.distortion),
+        )
 
     def unproject(self, points: ArrayLike) -> Array:
         """Unit rays (N, 3) in the camera frame of raw pixels (N, 2).
@@ -300,8 +322,10 @@ class RollingShutterCamera:
             by_pixel[:] = np.diag([1.0 / self.fx, 1.0 / self.fy])
         else:
             normalized, inverse = undistort_points(
-                normalized, self._lens.first_guess(normalized),
-                *self._lens.compiled(self.distortion))
+                normalized,
+                self._lens.first_guess(normalized),
+                *self._lens.compiled(self.distortion),
+            )
             np.divide(inverse, (self.fx, self.fy), out=by_pixel)
         return rays_with_jacobian(normalized, by_pixel)
 
@@ -346,34 +370,49 @@ class Intrinsics:
     image_height: int
 
     def __post_init__(self) -> None:
-        self.global_shutter_camera()   # checks intrinsics and distortion
+        self.global_shutter_camera()  # checks intrinsics and distortion
         for name in ('image_width', 'image_height', 'binning_x', 'binning_y'):
             validate.number(name, getattr(self, name), 1)
         for axis, offset, binning, size, sensor in (
-                ('x', self.x_offset, self.binning_x, self.image_width, self.width),
-                ('y', self.y_offset, self.binning_y, self.image_height, self.height)):
+            ('x', self.x_offset, self.binning_x, self.image_width, self.width),
+            ('y', self.y_offset, self.binning_y, self.image_height, self.height),
+        ):
             if offset < 0 or offset + binning * size > sensor:
                 raise InputError(
                     f'region of interest leaves the sensor in {axis}: offset {offset} and {size} '
-                    f'pixels of {binning} must lie within {sensor}')
+                    f'pixels of {binning} must lie within {sensor}'
+                )
 
     def global_shutter_camera(self) -> RollingShutterCamera:
         """Camera model of the full sensor with a readout time of 0."""
         return RollingShutterCamera(
-            width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy,
-            distortion_model=self.distortion_model, distortion=self.distortion, readout_time=0.0)
+            width=self.width,
+            height=self.height,
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            distortion_model=self.distortion_model,
+            distortion=self.distortion,
+            readout_time=0.0,
+        )
 
     def to_sensor(self, points: ArrayLike) -> Array:
         """Sensor pixels (N, 2) of pixels (N, 2) of the published image."""
         points = np.asarray(points, dtype=np.float64)
-        return ((points + 0.5) * (self.binning_x, self.binning_y)
-                + (self.x_offset, self.y_offset) - 0.5)
+        return (
+            (points + 0.5) * (self.binning_x, self.binning_y)
+            + (self.x_offset, self.y_offset)
+            - 0.5
+        )
 
     def to_image(self, points: ArrayLike) -> Array:
         """Pixels (N, 2) of the published image of sensor pixels (N, 2)."""
         points = np.asarray(points, dtype=np.float64)
-        return ((points + 0.5 - (self.x_offset, self.y_offset))
-                / (self.binning_x, self.binning_y) - 0.5)
+        return (points + 0.5 - (self.x_offset, self.y_offset)) / (
+            self.binning_x,
+            self.binning_y,
+        ) - 0.5
 
 
 @kernel
@@ -399,18 +438,24 @@ def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array
 
 
 @kernel
-def project_rotating(rays: Array, rows: Array, rotations: Array, height: int,
-                     intrinsics: tuple[float, float, float, float], distort: int,
-                     k: Array) -> Array:
+def project_rotating(
+    rays: Array,
+    rows: Array,
+    rotations: Array,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    distort: int,
+    k: Array,
+) -> Array:
     """`RollingShutterCamera.project_rotating` with `intrinsics` fx, fy, cx, cy.
 
     Row v images a ray if the orientation at the time of row v projects the ray into row v: a root
     of ``projected_row(v) - v``, found by the secant method. Rotations are linear between their
     rows, and beyond. `distort` is the address of the distortion's kernel, `k` its coefficients.
     """
-    settled = 0.01   # largest distance of the assumed row from the projected one [px]
+    settled = 0.01  # largest distance of the assumed row from the projected one [px]
     most_rounds = 12
-    nearest = 1e-9   # least depth in front of the camera
+    nearest = 1e-9  # least depth in front of the camera
     fx, fy, cx, cy = intrinsics
     out, rotated, values = np.empty((len(rays), 2)), np.empty(3), np.empty(6)
     per_row = (len(rotations) - 1) / max(height - 1.0, 1.0)

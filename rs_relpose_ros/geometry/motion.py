@@ -20,10 +20,10 @@ from rs_relpose_ros.geometry.so3 import (
 from rs_relpose_ros.jit import kernel
 
 # Far beyond any sensor: products of larger numbers may overflow.
-_LARGEST_RATE = 1e4   # [rad/s]
-_LONGEST = 1e6   # [s]
-_LARGEST = 1e4   # [m], [m/s], [m/s^2]
-_LARGEST_LEVER_ARM = 5.0   # [m]; more is a value in centimetres
+_LARGEST_RATE = 1e4  # [rad/s]
+_LONGEST = 1e6  # [s]
+_LARGEST = 1e4  # [m], [m/s], [m/s^2]
+_LARGEST_LEVER_ARM = 5.0  # [m]; more is a value in centimetres
 # Row times may lie outside of the gyro samples by this [s].
 _TOLERANCE = 1e-6
 
@@ -56,18 +56,30 @@ class FrameMotion:
         for name in ('knot_times', 'knot_rotations'):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
-        object.__setattr__(self, 'angular_velocity', validate.array(
-            'angular_velocity', self.angular_velocity, (3,), largest=_LARGEST_RATE, unit='rad/s'))
+        object.__setattr__(
+            self,
+            'angular_velocity',
+            validate.array(
+                'angular_velocity',
+                self.angular_velocity,
+                (3,),
+                largest=_LARGEST_RATE,
+                unit='rad/s',
+            ),
+        )
         if self.gravity is not None:
             gravity = validate.array('gravity', self.gravity, (3,), largest=1e6)
             if not np.abs(gravity).max() > 1e-6:
-                raise InputError('gravity must have a length > 1e-6 (None if it is not known), '
-                                 f'got {gravity.tolist()}')
+                raise InputError(
+                    'gravity must have a length > 1e-6 (None if it is not known), '
+                    f'got {gravity.tolist()}'
+                )
             object.__setattr__(self, 'gravity', gravity)
 
     @classmethod
-    def from_gyro(cls, times: ArrayLike, angular_velocities: ArrayLike,
-                  gravity: ArrayLike | None = None) -> FrameMotion:
+    def from_gyro(
+        cls, times: ArrayLike, angular_velocities: ArrayLike, gravity: ArrayLike | None = None
+    ) -> FrameMotion:
         """Exact integral of gyro samples over the rows.
 
         Parameters
@@ -85,16 +97,24 @@ class FrameMotion:
         validate.number('number of times', len(times), 2)
         validate.increasing('times', times)
         if not times[0] <= 0.0 <= times[-1]:
-            raise InputError('times must enclose 0, the time of the reference row, '
-                             f'got [{times[0]:.6f}, {times[-1]:.6f}] s')
+            raise InputError(
+                'times must enclose 0, the time of the reference row, '
+                f'got [{times[0]:.6f}, {times[-1]:.6f}] s'
+            )
         rotations = integrated_rotations(times, rates)
         # The mean over the rows: one sample has several times its noise.
-        mean_rate = (0.5 * (times[1:] - times[:-1]) @ (rates[1:] + rates[:-1])
-                     / (times[-1] - times[0]))
-        at_reference, _ = rotations_between(times, rotations, np.zeros(1),
-                                            times.searchsorted(np.zeros(1), side='right'))
-        return cls(mean_rate, None if gravity is None else np.asarray(gravity), times,
-                   at_reference[0].T @ rotations)
+        mean_rate = (
+            0.5 * (times[1:] - times[:-1]) @ (rates[1:] + rates[:-1]) / (times[-1] - times[0])
+        )
+        at_reference, _ = rotations_between(
+            times, rotations, np.zeros(1), times.searchsorted(np.zeros(1), side='right')
+        )
+        return cls(
+            mean_rate,
+            None if gravity is None else np.asarray(gravity),
+            times,
+            at_reference[0].T @ rotations,
+        )
 
     def rotations(self, row_times: ArrayLike) -> Array:
         """Orientation (N, 3, 3) at row times (N,) [s], in the frame of the reference row.
@@ -109,11 +129,13 @@ class FrameMotion:
             return rotations_at_rate(self.angular_velocity, tau)
         times = self.knot_times
         rotations, covered = rotations_between(
-            times, self.knot_rotations, tau, np.searchsorted(times, tau, side='right'))
+            times, self.knot_rotations, tau, np.searchsorted(times, tau, side='right')
+        )
         if not covered:
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
-                f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s')
+                f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s'
+            )
         return rotations
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
@@ -127,8 +149,12 @@ class FrameMotion:
         moved = self.gravity if self.gravity is None else rotation.T @ self.gravity
         if self.knot_times is None or self.knot_rotations is None:
             return validate.replaced(self, gravity=moved)
-        return validate.replaced(self, gravity=moved, knot_times=self.knot_times - delay,
-                                 knot_rotations=rotation.T @ self.knot_rotations)
+        return validate.replaced(
+            self,
+            gravity=moved,
+            knot_times=self.knot_times - delay,
+            knot_rotations=rotation.T @ self.knot_rotations,
+        )
 
 
 @kernel
@@ -141,8 +167,9 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
 
 
 @kernel
-def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
-                      after: NDArray[np.int64]) -> tuple[Array, bool]:
+def rotations_between(
+    knot_times: Array, knot_rotations: Array, times: Array, after: NDArray[np.int64]
+) -> tuple[Array, bool]:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
 
     `after` (N,): index of the first knot after each time. Also whether the knots enclose all
@@ -155,8 +182,9 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
     covered = True
     for i in range(len(times)):
         # Written so that NaN is not covered.
-        covered &= (times[i] >= knot_times[0] - _TOLERANCE
-                    and times[i] <= knot_times[-1] + _TOLERANCE)
+        covered &= (
+            times[i] >= knot_times[0] - _TOLERANCE and times[i] <= knot_times[-1] + _TOLERANCE
+        )
         time = min(max(times[i], knot_times[0]), knot_times[-1])
         k = min(max(after[i] - 1, 0), len(steps) - 1)
         fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
@@ -206,16 +234,23 @@ class InertialMotion:
     def __post_init__(self) -> None:
         validate.number('duration', self.duration, 1e-6, 1e6, 's')
         for name, unit, largest in (
-                ('alpha', 'm', _LARGEST), ('beta', 'm/s', _LARGEST),
-                ('lever_arm', 'm', _LARGEST_LEVER_ARM), ('acceleration1', 'm/s^2', _LARGEST),
-                ('acceleration2', 'm/s^2', _LARGEST)):
+            ('alpha', 'm', _LARGEST),
+            ('beta', 'm/s', _LARGEST),
+            ('lever_arm', 'm', _LARGEST_LEVER_ARM),
+            ('acceleration1', 'm/s^2', _LARGEST),
+            ('acceleration2', 'm/s^2', _LARGEST),
+        ):
             value = getattr(self, name)
             if value is None:
                 value = self.beta / self.duration
-            object.__setattr__(self, name, validate.array(
-                name, value, (3,), largest=largest, unit=unit))
-        object.__setattr__(self, 'covariance', validate.covariance(
-            'covariance', self.covariance, 6, largest=_LARGEST**2))
+            object.__setattr__(
+                self, name, validate.array(name, value, (3,), largest=largest, unit=unit)
+            )
+        object.__setattr__(
+            self,
+            'covariance',
+            validate.covariance('covariance', self.covariance, 6, largest=_LARGEST**2),
+        )
 
     def shifted(self, delay: float, turn: Array) -> InertialMotion:
         """The same motion between rows `delay` [s] later; camera 1 rotates by `turn` meanwhile.
@@ -225,8 +260,9 @@ class InertialMotion:
         """
         a1, a2 = np.asarray(self.acceleration1), np.asarray(self.acceleration2)
         change = a2 - a1
-        alpha = (self.alpha + delay * self.beta + 0.5 * delay**2 * change
-                 - delay * self.duration * a1)
+        alpha = (
+            self.alpha + delay * self.beta + 0.5 * delay**2 * change - delay * self.duration * a1
+        )
         beta = self.beta + delay * change
         # An error of beta changes alpha, too.
         jacobian = np.zeros((6, 6))
@@ -234,6 +270,10 @@ class InertialMotion:
         jacobian[:3, 3:] = delay * turn.T
         covariance = jacobian @ self.covariance @ jacobian.T
         return validate.replaced(
-            self, alpha=turn.T @ alpha, beta=turn.T @ beta,
-            covariance=0.5 * (covariance + covariance.T), acceleration1=turn.T @ a1,
-            acceleration2=turn.T @ a2)
+            self,
+            alpha=turn.T @ alpha,
+            beta=turn.T @ beta,
+            covariance=0.5 * (covariance + covariance.T),
+            acceleration1=turn.T @ a1,
+            acceleration2=turn.T @ a2,
+        )

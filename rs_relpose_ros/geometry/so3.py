@@ -15,7 +15,7 @@ from rs_relpose_ros.jit import kernel, small_kernel
 
 Vector = tuple[float, float, float]
 
-STANDARD_GRAVITY = 9.80665   # [m/s^2]
+STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 
 @small_kernel
@@ -54,17 +54,21 @@ def copy_matrix(source: Array, out: Array) -> None:
 @small_kernel
 def rotated(R: Array, v: Vector | Array) -> Vector:
     """``R v``, of any matrix (3, 3)."""
-    return (R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
-            R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
-            R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2])
+    return (
+        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
+    )
 
 
 @small_kernel
 def rotated_back(R: Array, v: Vector | Array) -> Vector:
     """``R^T v``, of any matrix (3, 3)."""
-    return (R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
-            R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
-            R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2])
+    return (
+        R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
+        R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
+        R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2],
+    )
 
 
 @kernel
@@ -144,7 +148,7 @@ def log_so3(rotation: Array) -> Array:
         q[k] = (rotation[k, i] + rotation[i, k]) / s
     if q[3] < 0.0:
         q = -q
-    sine = norm(q)   # of x, y, z
+    sine = norm(q)  # of x, y, z
     factor = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, q[3]) / sine
     vector = np.empty(3)
     for i in range(3):
@@ -159,8 +163,9 @@ def left_jacobian_so3(v: Array) -> Array:
     if theta2 < 1e-8:
         return _skew_series(v, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0)
     theta = math.sqrt(theta2)
-    return _skew_series(v, (1.0 - math.cos(theta)) / theta2,
-                        (theta - math.sin(theta)) / (theta2 * theta))
+    return _skew_series(
+        v, (1.0 - math.cos(theta)) / theta2, (theta - math.sin(theta)) / (theta2 * theta)
+    )
 
 
 @kernel
@@ -195,6 +200,7 @@ def aligning_rotation(correlation: Array) -> Array:
 
 
 # Order statistics: Numba's own sort takes seconds to compile.
+
 
 @kernel
 def smallest(values: Array, k: int) -> float:
@@ -236,6 +242,7 @@ def median(values: Array) -> float:
 #     phi_k = (w_k + w_{k+1}) dt / 2 + (w_k x w_{k+1}) dt^2 / 12
 #
 # Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
+
 
 @small_kernel
 def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:

@@ -36,9 +36,15 @@ _APART = 1.0
 
 def clocks_apart(ahead: float) -> str:
     """Message on stamps of the IMU that are `ahead` [s] of the images'; empty if by little."""
-    return '' if abs(ahead) < _APART else (
-        f"the clock of the IMU is {abs(ahead):.1f} s {'ahead of' if ahead > 0.0 else 'behind'} "
-        "the images'")
+    return (
+        ''
+        if abs(ahead) < _APART
+        else (
+            f'the clock of the IMU is {abs(ahead):.1f} s '
+            f'{"ahead of" if ahead > 0.0 else "behind"} '
+            "the images'"
+        )
+    )
 
 
 # Steps of so many medians have an image missing.
@@ -72,13 +78,13 @@ def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
 class ImageClock:
     """Times of an image's rows on the IMU clock."""
 
-    camera: RollingShutterCamera   # its reference row is the one that the driver stamps
-    time_offset: float = 0.0   # [s] IMU clock minus camera clock
-    stamp_exposure: str = 'middle'   # time of that row's exposure which the stamp marks
-    exposure_time: float = 0.0   # [s] of one row
-    offset_per_interval: float = 0.0   # k [s/s]
-    reference_interval: float = 0.0   # T_ref [s]
-    exposure_margin: float = 0.0   # [s]; if not 0, the exposure is T less this
+    camera: RollingShutterCamera  # its reference row is the one that the driver stamps
+    time_offset: float = 0.0  # [s] IMU clock minus camera clock
+    stamp_exposure: str = 'middle'  # time of that row's exposure which the stamp marks
+    exposure_time: float = 0.0  # [s] of one row
+    offset_per_interval: float = 0.0  # k [s/s]
+    reference_interval: float = 0.0  # T_ref [s]
+    exposure_margin: float = 0.0  # [s]; if not 0, the exposure is T less this
 
     def __post_init__(self) -> None:
         validate.choice('stamp_exposure', self.stamp_exposure, STAMP_EXPOSURES)
@@ -89,7 +95,8 @@ class ImageClock:
         offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure(interval_ns))
         if interval_ns is not None:
             offset += self.offset_per_interval * (
-                interval_ns / NANOSECONDS - self.reference_interval)
+                interval_ns / NANOSECONDS - self.reference_interval
+            )
         return stamp_ns + to_nanoseconds(offset)
 
     def exposure(self, interval_ns: int | None = None) -> float:
@@ -104,8 +111,10 @@ class ImageClock:
         reference = self.reference_ns(stamp_ns, interval_ns)
         earliest, latest = self.camera.row_time_span
         half = to_nanoseconds(0.5 * self.exposure(interval_ns))
-        return (reference + to_nanoseconds(earliest) - half,
-                reference + to_nanoseconds(latest) + half)
+        return (
+            reference + to_nanoseconds(earliest) - half,
+            reference + to_nanoseconds(latest) + half,
+        )
 
 
 class Sensor(NamedTuple):
@@ -114,10 +123,10 @@ class Sensor(NamedTuple):
     `config.settings.sensor_model` builds it for a parameter set.
     """
 
-    camera: RollingShutterCamera   # its reference row is the one that poses relate
+    camera: RollingShutterCamera  # its reference row is the one that poses relate
     intrinsics: Intrinsics
-    clock: ImageClock   # of that row
-    pose_row_delay: float = 0.0   # [s] from the stamped row to it
+    clock: ImageClock  # of that row
+    pose_row_delay: float = 0.0  # [s] from the stamped row to it
 
     def derotated(self, points: Array, motion: FrameMotion) -> tuple[Array, Array]:
         """Rays (N, 3) of pixels (N, 2) of a published image, and their row times (N,) [s]."""
@@ -136,8 +145,9 @@ class Sensor(NamedTuple):
         for _ in range(2):
             rotations = motion.rotations(np.clip(row_times, first, last))
             pixels = camera.project(np.einsum('nji,nj->ni', rotations, rays))
-            row_times = np.where(np.isfinite(pixels[:, 1]), camera.row_times(pixels[:, 1]),
-                                 row_times)
+            row_times = np.where(
+                np.isfinite(pixels[:, 1]), camera.row_times(pixels[:, 1]), row_times
+            )
         return self.intrinsics.to_image(pixels)
 
 
@@ -160,8 +170,11 @@ class FrameIntervals:
             if difference <= 0:
                 return kept
             # 2 d > 3 T and |d - d_before| > d / 10, in integers.
-            missing = (kept is not None and 2 * difference > 3 * kept
-                       and 10 * abs(difference - self._difference_ns) > difference)
+            missing = (
+                kept is not None
+                and 2 * difference > 3 * kept
+                and 10 * abs(difference - self._difference_ns) > difference
+            )
             if not missing:
                 self._interval_ns = difference
             self._difference_ns = difference

@@ -37,7 +37,7 @@ def unchecked(kind: type[Data], **values: Any) -> Data:
 
 def replaced(data: Data, **changes: Any) -> Data:
     """As `dataclasses.replace`, `unchecked`."""
-    fields = {name: getattr(data, name) for name in type(data).__slots__}   # type: ignore[attr-defined]
+    fields = {name: getattr(data, name) for name in type(data).__slots__}  # type: ignore[attr-defined]
     return unchecked(type(data), **fields | changes)
 
 
@@ -49,8 +49,15 @@ def legal_range(low: float, high: float, unit: str = '') -> str:
     return f'>= {low:g}{unit} and finite' if high == math.inf else f'in [{low:g}, {high:g}]{unit}'
 
 
-def number(name: str, value: Number, low: float = -math.inf, high: float = math.inf,
-           unit: str = '', *, whole: bool = False) -> Number:
+def number(
+    name: str,
+    value: Number,
+    low: float = -math.inf,
+    high: float = math.inf,
+    unit: str = '',
+    *,
+    whole: bool = False,
+) -> Number:
     """A finite number in [low, high]; `whole`: without a fraction."""
     if not _is_within(value, low, high) or (whole and int(value) != value):
         kind = 'a whole number, ' if whole else ''
@@ -61,7 +68,7 @@ def number(name: str, value: Number, low: float = -math.inf, high: float = math.
 def _is_within(value: Any, low: float, high: float) -> bool:
     try:
         return bool(low <= value <= high and abs(value) < math.inf)
-    except (TypeError, ValueError):   # no number
+    except (TypeError, ValueError):  # no number
         return False
 
 
@@ -72,8 +79,14 @@ def choice(name: str, value: str, choices: Collection[str]) -> str:
     return value
 
 
-def array(name: str, value: ArrayLike | None, shape: tuple[int | str, ...], *,
-          largest: float = _FLOAT_MAX, unit: str = '') -> Array:
+def array(
+    name: str,
+    value: ArrayLike | None,
+    shape: tuple[int | str, ...],
+    *,
+    largest: float = _FLOAT_MAX,
+    unit: str = '',
+) -> Array:
     """Finite numbers of a shape, none of a magnitude beyond `largest` [`unit`].
 
     `shape`: sizes, and names such as 'N' of sizes that may be any, 0 too.
@@ -82,18 +95,24 @@ def array(name: str, value: ArrayLike | None, shape: tuple[int | str, ...], *,
         checked = np.array(value, dtype=np.float64, order='C')
     except (TypeError, ValueError):
         raise InputError(f'{name} must be an array of numbers, got {value!r}') from None
-    if checked.shape != shape and (checked.ndim != len(shape) or any(
+    if checked.shape != shape and (
+        checked.ndim != len(shape)
+        or any(
             isinstance(size, int) and size != found
-            for size, found in zip(shape, checked.shape, strict=True))):
+            for size, found in zip(shape, checked.shape, strict=True)
+        )
+    ):
         comma = ',' if len(shape) == 1 else ''
-        raise InputError(f'{name} must have shape ({", ".join(map(str, shape))}{comma}), '
-                         f'got {checked.shape}')
-    legal = np.abs(checked) <= largest   # not NaN
+        raise InputError(
+            f'{name} must have shape ({", ".join(map(str, shape))}{comma}), got {checked.shape}'
+        )
+    legal = np.abs(checked) <= largest  # not NaN
     if not legal.all():
         place = np.unravel_index(np.argmin(legal), legal.shape)
         text = 'finite' if largest == _FLOAT_MAX else f'finite and within {largest:g} {unit}'
-        raise InputError(f'{name} must be {text.rstrip()}, got {checked[place]} '
-                         f'at {[int(k) for k in place]}')
+        raise InputError(
+            f'{name} must be {text.rstrip()}, got {checked[place]} at {[int(k) for k in place]}'
+        )
     return checked
 
 
@@ -120,22 +139,36 @@ def rotations(name: str, value: ArrayLike | None, shape: tuple[int | str, ...] =
     """A rotation matrix (3, 3), or several of them (K, 3, 3)."""
     # Bounded first, so that the product cannot overflow.
     R = array(name, value, shape, largest=2.0)
-    if not ((np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)) < _ROUNDING_ROTATION).all()
-            and (np.linalg.det(R) > 0.0).all()):
-        raise InputError(f'{name} must be a rotation matrix (orthonormal, determinant +1), '
-                         f'got {R.tolist()}')
+    if not (
+        (np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)) < _ROUNDING_ROTATION).all()
+        and (np.linalg.det(R) > 0.0).all()
+    ):
+        raise InputError(
+            f'{name} must be a rotation matrix (orthonormal, determinant +1), got {R.tolist()}'
+        )
     return R
 
 
-def covariance(name: str, value: ArrayLike, size: int, *, largest: float = _FLOAT_MAX,
-               unit: str = '', rounding: float = 1e-9) -> Array:
+def covariance(
+    name: str,
+    value: ArrayLike,
+    size: int,
+    *,
+    largest: float = _FLOAT_MAX,
+    unit: str = '',
+    rounding: float = 1e-9,
+) -> Array:
     """A symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
     matrix = array(name, value, (size, size), largest=largest, unit=unit)
     most = np.abs(matrix).max()
-    if most > 0.0 and (np.abs(matrix - matrix.T).max() > _ROUNDING_SYMMETRY * max(1.0, most)
-                       or np.linalg.eigvalsh(matrix)[0] < -rounding):
-        raise InputError(f'{name} must be a covariance matrix (symmetric, no negative '
-                         f'eigenvalue), got {matrix.tolist()}')
+    if most > 0.0 and (
+        np.abs(matrix - matrix.T).max() > _ROUNDING_SYMMETRY * max(1.0, most)
+        or np.linalg.eigvalsh(matrix)[0] < -rounding
+    ):
+        raise InputError(
+            f'{name} must be a covariance matrix (symmetric, no negative '
+            f'eigenvalue), got {matrix.tolist()}'
+        )
     return matrix
 
 
@@ -146,5 +179,7 @@ def increasing(name: str, values: NDArray[Any]) -> None:
     rises = values[1:] > values[:-1]
     if not rises.all():
         k = int(np.argmin(rises))
-        raise InputError(f'{name} must be strictly increasing, got {values[k + 1]} after '
-                         f'{values[k]} at [{k + 1}]')
+        raise InputError(
+            f'{name} must be strictly increasing, got {values[k + 1]} after '
+            f'{values[k]} at [{k + 1}]'
+        )

@@ -45,12 +45,12 @@ class Series:
     @property
     def stamps(self) -> Stamps:
         """Stamps (K,) [ns], strictly increasing; a view until the next insertion."""
-        return self._stamps[self._start:self._end]
+        return self._stamps[self._start : self._end]
 
     @property
     def values(self) -> Array:
         """Values (K, width); likewise a view."""
-        return self._values[self._start:self._end]
+        return self._values[self._start : self._end]
 
     @property
     def newest_ns(self) -> int | None:
@@ -73,8 +73,8 @@ class Series:
             self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
             self._start, self._end = 0, len(stamps)
         at = self._start + position
-        self._stamps[at + 1:self._end + 1] = self._stamps[at:self._end]
-        self._values[at + 1:self._end + 1] = self._values[at:self._end]
+        self._stamps[at + 1 : self._end + 1] = self._stamps[at : self._end]
+        self._values[at + 1 : self._end + 1] = self._values[at : self._end]
         self._stamps[at], self._values[at] = stamp_ns, value
         self._end += 1
         return True
@@ -91,11 +91,19 @@ class Series:
             return None
         if start_ns == end_ns:
             return np.array([start_ns]), self._interpolated(start_ns)[None]
-        inside = slice(int(self.stamps.searchsorted(start_ns, 'right')),
-                       int(self.stamps.searchsorted(end_ns)))
-        return (np.concatenate([[start_ns], self.stamps[inside], [end_ns]]),
-                np.concatenate([self._interpolated(start_ns)[None], self.values[inside],
-                                self._interpolated(end_ns)[None]]))
+        inside = slice(
+            int(self.stamps.searchsorted(start_ns, 'right')), int(self.stamps.searchsorted(end_ns))
+        )
+        return (
+            np.concatenate([[start_ns], self.stamps[inside], [end_ns]]),
+            np.concatenate(
+                [
+                    self._interpolated(start_ns)[None],
+                    self.values[inside],
+                    self._interpolated(end_ns)[None],
+                ]
+            ),
+        )
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps, values = self.stamps, self.values
@@ -110,7 +118,7 @@ class Series:
         """Stamps within an interval, and one on either side of it."""
         stamps = self.stamps
         first = max(int(stamps.searchsorted(start_ns, 'right')) - 1, 0)
-        return stamps[first:int(stamps.searchsorted(end_ns)) + 1]
+        return stamps[first : int(stamps.searchsorted(end_ns)) + 1]
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
@@ -127,9 +135,9 @@ class Series:
 class ImuSample:
     """Content of one message, in the IMU frame; None for a sensor that it does not contain."""
 
-    stamp_ns: int   # on the IMU clock
-    angular_velocity: Vector | None   # [rad/s]
-    linear_acceleration: Vector | None   # [m/s^2] specific force: 9.81 upwards at rest (REP-145)
+    stamp_ns: int  # on the IMU clock
+    angular_velocity: Vector | None  # [rad/s]
+    linear_acceleration: Vector | None  # [m/s^2] specific force: 9.81 upwards at rest (REP-145)
     # Of an orientation that the IMU computes, with a covariance in the message: unit direction of
     # free fall (minus the world's z, REP-103), and its sigma per axis [rad].
     orientation: tuple[float, float, float, float] | None = None
@@ -152,10 +160,15 @@ def length_fault(length: float) -> str:
     low, high = (bound * STANDARD_GRAVITY for bound in _LIKELY_LENGTHS)
     if low <= length <= high:
         return ''
-    hint = ', these are g' if abs(length - 1.0) < 0.15 else (
-        ', gravity is removed' if length < 0.5 * STANDARD_GRAVITY else '')
-    return ForceFault(f'the accelerometer reads {length:.3g} m/s^2 in the mean, not '
-                      f'{STANDARD_GRAVITY}{hint}: it must be specific force in m/s^2 (REP-145)')
+    hint = (
+        ', these are g'
+        if abs(length - 1.0) < 0.15
+        else (', gravity is removed' if length < 0.5 * STANDARD_GRAVITY else '')
+    )
+    return ForceFault(
+        f'the accelerometer reads {length:.3g} m/s^2 in the mean, not '
+        f'{STANDARD_GRAVITY}{hint}: it must be specific force in m/s^2 (REP-145)'
+    )
 
 
 def force_fault(forces: Array) -> str:
@@ -167,8 +180,9 @@ def force_fault(forces: Array) -> str:
     size = np.abs(forces)
     if size.max() < _LEAST_RANGE * STANDARD_GRAVITY:
         return ''
-    equal = (forces[1:] == forces[:-1]) & (size[1:] >= np.maximum(
-        0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY))
+    equal = (forces[1:] == forces[:-1]) & (
+        size[1:] >= np.maximum(0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY)
+    )
     clipped = (equal[1:] & equal[:-1]).any()
     return f'the accelerometer is clipped at {size.max():.3g} m/s^2' if clipped else ''
 
@@ -192,8 +206,9 @@ class ImuInterval(NamedTuple):
 
     def mean_force(self, gyro_bias: Array) -> Array:
         """Mean specific force (3,) in the axes of the last sample."""
-        rotations = integrated_rotations(self.seconds, np.ascontiguousarray(
-            self.rates - gyro_bias))
+        rotations = integrated_rotations(
+            self.seconds, np.ascontiguousarray(self.rates - gyro_bias)
+        )
         mean = np.einsum('kij,kj->i', rotations, self.forces) / len(self.forces)
         return np.asarray(rotations[-1].T @ mean)
 
@@ -238,11 +253,14 @@ class ImuSamples:
 
     def add(self, sample: ImuSample) -> bool:
         """Store a sample, or False for a duplicate; InputError if a value is not finite."""
-        for name, value in (('angular_velocity', sample.angular_velocity),
-                            ('linear_acceleration', sample.linear_acceleration)):
+        for name, value in (
+            ('angular_velocity', sample.angular_velocity),
+            ('linear_acceleration', sample.linear_acceleration),
+        ):
             if value is not None and not all(map(math.isfinite, value)):
-                raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
-                                 f'got {list(value)}')
+                raise InputError(
+                    f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, got {list(value)}'
+                )
         added = self.gyro.insert(sample.stamp_ns, sample.angular_velocity)
         added |= self.force.insert(sample.stamp_ns, sample.linear_acceleration)
         return self._down.insert(sample.stamp_ns, sample.orientation) or added
@@ -265,12 +283,20 @@ class ImuSamples:
 
     def between(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Samples of both sensors from one time to a later one; None if one has a gap."""
-        if (end_ns <= start_ns or (gyro := self.gyro.between(start_ns, end_ns)) is None
-                or (force := self.force.between(start_ns, end_ns)) is None):
+        if (
+            end_ns <= start_ns
+            or (gyro := self.gyro.between(start_ns, end_ns)) is None
+            or (force := self.force.between(start_ns, end_ns)) is None
+        ):
             return None
-        return ImuInterval(*integration.at_common_times(
-            (gyro[0] - start_ns) / NANOSECONDS, gyro[1],
-            (force[0] - start_ns) / NANOSECONDS, force[1]))
+        return ImuInterval(
+            *integration.at_common_times(
+                (gyro[0] - start_ns) / NANOSECONDS,
+                gyro[1],
+                (force[0] - start_ns) / NANOSECONDS,
+                force[1],
+            )
+        )
 
     def up_to(self, end_ns: int, seconds: float) -> ImuInterval | None:
         """Samples of both sensors of at most the last `seconds` before a time, if any."""
@@ -313,8 +339,9 @@ class ImuBuffer(ImuSamples):
         self._run_filters(before_ns)
         super().prune(before_ns)
 
-    def angular_velocity(self, start_ns: int, end_ns: int,
-                         exposure: float = 0.0) -> tuple[Stamps, Array]:
+    def angular_velocity(
+        self, start_ns: int, end_ns: int, exposure: float = 0.0
+    ) -> tuple[Stamps, Array]:
         """Stamps (K,), rates (K, 3) [rad/s] of an interval, borders interpolated, IMU frame.
 
         The `bias` of `end_ns` is subtracted; each rate is the mean over `exposure` [s]
@@ -326,8 +353,10 @@ class ImuBuffer(ImuSamples):
         rows = self.gyro.between(start_ns, end_ns)
         exposed = self.gyro.between(start_ns - half, end_ns + half) if half else rows
         if exposed is None or rows is None:
-            raise InputError(f'the gyro does not cover [{start_ns - half}, {end_ns + half}] ns: '
-                             f'{self.gyro.coverage(start_ns - half, end_ns + half).value}')
+            raise InputError(
+                f'the gyro does not cover [{start_ns - half}, {end_ns + half}] ns: '
+                f'{self.gyro.coverage(start_ns - half, end_ns + half).value}'
+            )
         stamps_ns, rates = rows
         if half:
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
@@ -338,8 +367,11 @@ class ImuBuffer(ImuSamples):
         stamps = self.force.stamps
         # Half of the buffer, which is there independently of the time of the query.
         start_ns = until_ns - (self._keep_ns // 2 if duration_ns is None else duration_ns)
-        return self.force.values[int(np.searchsorted(stamps, start_ns)):
-                                  int(np.searchsorted(stamps, until_ns, side='right'))]
+        return self.force.values[
+            int(np.searchsorted(stamps, start_ns)) : int(
+                np.searchsorted(stamps, until_ns, side='right')
+            )
+        ]
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at a time, from samples up to it; to be called in the order of time."""
@@ -349,8 +381,9 @@ class ImuBuffer(ImuSamples):
     def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """``R_start^T R_end`` (3, 3) in the IMU frame, covariance: see `integrate_rotation`."""
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
-        return integration.integrate_rotation(stamps_ns, rates, self._config,
-                                              self.bias(end_ns).sigma)
+        return integration.integrate_rotation(
+            stamps_ns, rates, self._config, self.bias(end_ns).sigma
+        )
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
         """Direction of gravity at a time that the gyro covers, from samples up to it, if any.
@@ -368,13 +401,19 @@ class ImuBuffer(ImuSamples):
         last = int(np.searchsorted(self._down.stamps, at_ns, side='right')) - 1
         if last >= 0 and self._config.use_imu_orientation:
             own_ns, (*down, sigma) = int(self._down.stamps[last]), self._down.values[last].tolist()
-            if at_ns - own_ns <= self._gap_ns and (own := self._propagated(
-                    GravityEstimate(np.array(down), sigma), own_ns, at_ns)) is not None:
+            if (
+                at_ns - own_ns <= self._gap_ns
+                and (
+                    own := self._propagated(GravityEstimate(np.array(down), sigma), own_ns, at_ns)
+                )
+                is not None
+            ):
                 return filters.agreed_gravity(own, estimate)
         return estimate
 
-    def _propagated(self, estimate: GravityEstimate, from_ns: int,
-                    to_ns: int) -> GravityEstimate | None:
+    def _propagated(
+        self, estimate: GravityEstimate, from_ns: int, to_ns: int
+    ) -> GravityEstimate | None:
         """An estimate propagated to another time by the gyro; None if that has a gap."""
         start_ns, end_ns = sorted((from_ns, to_ns))
         if self.gyro.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
@@ -403,9 +442,16 @@ class ImuBuffer(ImuSamples):
             self._filtered_ns = int(stamps[-1])
 
 
-def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
-              previous_reference_ns: int | None = None, exposure: float = 0.0, *,
-              gyro_only: bool = False) -> FrameImu:
+def frame_imu(
+    buffer: ImuBuffer,
+    span_ns: tuple[int, int],
+    reference_ns: int,
+    R_cam_imu: Array,
+    previous_reference_ns: int | None = None,
+    exposure: float = 0.0,
+    *,
+    gyro_only: bool = False,
+) -> FrameImu:
     """The IMU's share of a frame; all times are on the IMU clock, ``v_cam = R_cam_imu v_imu``.
 
     `span_ns`: from the first row's exposure to the end of the last one's; `reference_ns`,
@@ -413,7 +459,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
     [s]: of a row; `gyro_only`: without gravity and specific force.
     """
     half = to_nanoseconds(0.5 * exposure)
-    start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half   # of the rows' times
+    start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half  # of the rows' times
     stamps_ns, rates = buffer.angular_velocity(start_ns, end_ns, exposure)
     rates = rates @ R_cam_imu.T
     if end_ns > start_ns:
@@ -428,22 +474,40 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
         motion = validate.replaced(motion, gravity=R @ (R_cam_imu @ estimate.direction))
         gravity_sigma = estimate.sigma
     since_previous = None
-    if (previous_reference_ns is not None and previous_reference_ns < reference_ns
-            and buffer.gyro.coverage(previous_reference_ns - half, reference_ns + half)
-            is Coverage.AVAILABLE):
+    if (
+        previous_reference_ns is not None
+        and previous_reference_ns < reference_ns
+        and buffer.gyro.coverage(previous_reference_ns - half, reference_ns + half)
+        is Coverage.AVAILABLE
+    ):
         stamps_ns, rates = buffer.angular_velocity(previous_reference_ns, reference_ns, exposure)
         bias = buffer.bias(reference_ns)
-        since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value,
-                                     bias.sigma)
-    return FrameImu(motion, gravity_sigma, reference_ns, since_previous, exposure=exposure,
-                    force='not needed' if gyro_only else _frame_force(
-                        buffer, span_ns, reference_ns, R_cam_imu, motion, previous_reference_ns,
-                        estimate))
+        since_previous = GyroSegment(
+            stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value, bias.sigma
+        )
+    return FrameImu(
+        motion,
+        gravity_sigma,
+        reference_ns,
+        since_previous,
+        exposure=exposure,
+        force='not needed'
+        if gyro_only
+        else _frame_force(
+            buffer, span_ns, reference_ns, R_cam_imu, motion, previous_reference_ns, estimate
+        ),
+    )
 
 
-def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
-                 motion: FrameMotion, previous_reference_ns: int | None,
-                 gravity: GravityEstimate | None) -> FrameForce | str:
+def _frame_force(
+    buffer: ImuBuffer,
+    span_ns: tuple[int, int],
+    reference_ns: int,
+    R_cam_imu: Array,
+    motion: FrameMotion,
+    previous_reference_ns: int | None,
+    gravity: GravityEstimate | None,
+) -> FrameForce | str:
     """The accelerometer's share of a frame, or the reason why there is none."""
     if fault := force_fault(buffer.recent_forces(span_ns[1])):
         return fault
@@ -457,5 +521,9 @@ def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int,
     forces = np.einsum('kij,kj->ki', motion.rotations(seconds), forces @ R_cam_imu.T)
     steps = np.diff(seconds, append=seconds[-1]) + np.diff(seconds, prepend=seconds[0])
     mean = forces[0] if len(forces) == 1 else steps @ forces / steps.sum()
-    return FrameForce(mean, gravity.length, gravity.length_sigma,
-                      ForceSegment(before[0], before[1] @ R_cam_imu.T))
+    return FrameForce(
+        mean,
+        gravity.length,
+        gravity.length_sigma,
+        ForceSegment(before[0], before[1] @ R_cam_imu.T),
+    )

@@ -58,8 +58,11 @@ _GATE = 4.0
 
 def is_at_rest(rates: Array, forces: Array) -> bool:
     """Whether gyro and accelerometer (K, 3) hardly vary; not if too few, or one is NaN."""
-    return bool(len(rates) >= _LEAST_SAMPLES and rates.std(axis=0).max() < _REST_RATE
-                and forces.std(axis=0).max() < _REST_FORCE)
+    return bool(
+        len(rates) >= _LEAST_SAMPLES
+        and rates.std(axis=0).max() < _REST_RATE
+        and forces.std(axis=0).max() < _REST_FORCE
+    )
 
 
 class GyroBias(NamedTuple):
@@ -90,7 +93,10 @@ class BiasTracker:
         self._measured_ns = 0
         self._rest: _Rest | None = None
         self._pending: tuple[NDArray[np.int64], Array, Array] = (
-            np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
+            np.empty(0, dtype=np.int64),
+            np.empty((0, 3)),
+            np.empty((0, 3)),
+        )
 
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
         """Process later samples: stamps (K,), rates [rad/s], forces [m/s^2], or NaN."""
@@ -103,7 +109,7 @@ class BiasTracker:
         # A window is complete with the first sample after its end.
         while start < len(stamps_ns) and stamps_ns[-1] >= stamps_ns[start] + _WINDOW_NS:
             end = int(np.searchsorted(stamps_ns, stamps_ns[start] + _WINDOW_NS))
-            self._evaluate(stamps_ns[start:end + 1], rates[start:end], forces[start:end])
+            self._evaluate(stamps_ns[start : end + 1], rates[start:end], forces[start:end])
             start = end
         self._pending = stamps_ns[start:], rates[start:], forces[start:]
 
@@ -156,30 +162,30 @@ _OWN_GATE = 4.0
 class GravityEstimate:
     """Direction of gravity, and length of the specific force at rest as measured."""
 
-    direction: Array   # (3,) of free fall, unit, IMU frame
-    sigma: float   # [rad] per axis
-    length: float = STANDARD_GRAVITY   # [m/s^2], scale and bias along gravity included
-    length_sigma: float = LENGTH_SIGMA   # 1 sigma
+    direction: Array  # (3,) of free fall, unit, IMU frame
+    sigma: float  # [rad] per axis
+    length: float = STANDARD_GRAVITY  # [m/s^2], scale and bias along gravity included
+    length_sigma: float = LENGTH_SIGMA  # 1 sigma
 
 
 class _Noise(NamedTuple):
     """Noise of the filter, per axis."""
 
-    acceleration: float   # [m^2/s^4] variance of the camera's own acceleration
-    turning: float   # [rad^2/s] growth of the variance of the direction that sets the gain
-    gyro: float   # [rad^2/s] that of the gyro's white noise alone
-    bias: float   # [rad^2/s^3] growth of the variance of the gyro bias
+    acceleration: float  # [m^2/s^4] variance of the camera's own acceleration
+    turning: float  # [rad^2/s] growth of the variance of the direction that sets the gain
+    gyro: float  # [rad^2/s] that of the gyro's white noise alone
+    bias: float  # [rad^2/s^3] growth of the variance of the gyro bias
 
 
 class _State(NamedTuple):
     """State of the filter, which the kernels update in place; all in the IMU frame."""
 
-    up: Array   # (3,) u
-    bias: Array   # (3,) b [rad/s]
-    covariance: Array   # (6, 6) P, of (d, e), which sets the gain
-    errors: Array   # (6, 6) E, of (d, e) as they are
-    residual: Array   # (3,) mean of f / |f| - u over about the last second
-    length: Array   # (2,) of the specific force at rest [m/s^2], and its variance
+    up: Array  # (3,) u
+    bias: Array  # (3,) b [rad/s]
+    covariance: Array  # (6, 6) P, of (d, e), which sets the gain
+    errors: Array  # (6, 6) E, of (d, e) as they are
+    residual: Array  # (3,) mean of f / |f| - u over about the last second
+    length: Array  # (2,) of the specific force at rest [m/s^2], and its variance
 
 
 class GravityFilter:
@@ -188,16 +194,26 @@ class GravityFilter:
     def __init__(self, config: ImuConfig) -> None:
         self._config = config
         self._gap_ns = to_nanoseconds(config.max_imu_gap)
-        across = (config.gravity_acceleration_sigma / STANDARD_GRAVITY)**2
+        across = (config.gravity_acceleration_sigma / STANDARD_GRAVITY) ** 2
         # Growth of the direction's variance for a stationary gain of dt / time constant.
-        turning = (across * _CORRELATION_TIME / config.gravity_time_constant**2
-                   + config.gyro_noise_density**2)
+        turning = (
+            across * _CORRELATION_TIME / config.gravity_time_constant**2
+            + config.gyro_noise_density**2
+        )
         self._noise = _Noise(
-            config.gravity_acceleration_sigma**2, turning, config.gyro_noise_density**2,
-            config.gyro_bias_sigma**2 / BIAS_MEMORY)
+            config.gravity_acceleration_sigma**2,
+            turning,
+            config.gyro_noise_density**2,
+            config.gyro_bias_sigma**2 / BIAS_MEMORY,
+        )
         self._state = _State(
-            np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(3),
-            np.array([STANDARD_GRAVITY, LENGTH_SIGMA**2]))
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros((6, 6)),
+            np.zeros((6, 6)),
+            np.zeros(3),
+            np.array([STANDARD_GRAVITY, LENGTH_SIGMA**2]),
+        )
         for covariance in (self._state.covariance, self._state.errors):
             covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
         # Of the last sample processed: None while the direction is unknown.
@@ -211,8 +227,16 @@ class GravityFilter:
             if self.stamp_ns is None:
                 k = self._begin(k, stamps_ns, rates, forces)
                 continue
-            done = _advance(self._state, self._noise, self.stamp_ns, self._rate, stamps_ns[k:],
-                            rates[k:], forces[k:], self._gap_ns)
+            done = _advance(
+                self._state,
+                self._noise,
+                self.stamp_ns,
+                self._rate,
+                stamps_ns[k:],
+                rates[k:],
+                forces[k:],
+                self._gap_ns,
+            )
             if done:
                 k += done
                 self.stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
@@ -231,9 +255,10 @@ class GravityFilter:
         # The part of the mean residual above the noise is lasting and biases the direction.
         residual = self._state.residual - up * (up @ self._state.residual)
         of_noise = 2.0 * self._noise.acceleration / STANDARD_GRAVITY**2
-        unexplained = max(float(residual @ residual)
-                          - of_noise * _CORRELATION_TIME / _LASTING, 0.0)
-        variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0)**2
+        unexplained = max(
+            float(residual @ residual) - of_noise * _CORRELATION_TIME / _LASTING, 0.0
+        )
+        variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0) ** 2
         length, length_variance = self._state.length
         return GravityEstimate(-up, math.sqrt(variance), float(length), math.sqrt(length_variance))
 
@@ -248,15 +273,22 @@ class GravityFilter:
         state.up[:], state.residual[:] = forces[first] / length, 0.0
         for covariance in (state.covariance, state.errors):
             covariance[:3, 3:] = covariance[3:, :3] = 0.0
-            covariance[:3, :3] = (_direction_variance(length, self._noise.acceleration)
-                                  * np.eye(3))
+            covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
         self.stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
         return first + 1
 
 
 @kernel
-def _advance(state: _State, noise: _Noise, stamp_ns: int, rate: Array,
-             stamps_ns: NDArray[np.int64], rates: Array, forces: Array, gap_ns: int) -> int:
+def _advance(
+    state: _State,
+    noise: _Noise,
+    stamp_ns: int,
+    rate: Array,
+    stamps_ns: NDArray[np.int64],
+    rates: Array,
+    forces: Array,
+    gap_ns: int,
+) -> int:
     """Filter samples after one of `stamp_ns` and `rate` (3,) up to the first gap; their number."""
     turn = np.empty(3)
     for k in range(len(stamps_ns)):
@@ -334,7 +366,7 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
         S[i, i] = variance
     _add_product(H, PHt, S)
     _mirror(S)
-    for i in range(3):   # S^-1 = adj S / det S
+    for i in range(3):  # S^-1 = adj S / det S
         adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
     determinant = dot(S[0], adjugate[0])
     K, KHP = np.zeros((6, 3)), np.empty((6, 6))
@@ -352,7 +384,7 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     P -= KHP
     _mirror(P)
     rest, half = np.eye(6), np.zeros((6, 6))
-    _add_product(-K, H, rest)   # I - K H
+    _add_product(-K, H, rest)  # I - K H
     _add_product(rest, E, half)
     _write_product_transposed(half, rest, E)
     for i in range(6):
@@ -421,6 +453,8 @@ def agreed_gravity(own: GravityEstimate, measured: GravityEstimate | None) -> Gr
     if measured is None:
         return own
     own = replace(own, length=measured.length, length_sigma=measured.length_sigma)
-    apart = math.atan2(float(np.linalg.norm(np.cross(own.direction, measured.direction))),
-                       float(own.direction @ measured.direction))
+    apart = math.atan2(
+        float(np.linalg.norm(np.cross(own.direction, measured.direction))),
+        float(own.direction @ measured.direction),
+    )
     return own if apart <= _OWN_GATE * math.hypot(own.sigma, measured.sigma) else measured

@@ -24,8 +24,8 @@ from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
 # Largest values of an IMU: far above any sensor, far below an overflow of the filters.
-MAX_ANGULAR_VELOCITY = 1e3   # rad/s
-MAX_LINEAR_ACCELERATION = 1e4   # m/s^2
+MAX_ANGULAR_VELOCITY = 1e3  # rad/s
+MAX_LINEAR_ACCELERATION = 1e4  # m/s^2
 
 
 class TruePose(NamedTuple):
@@ -58,15 +58,24 @@ def image_from_message(msg: Any) -> images.EncodedImage:
     stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
         return images.CompressedImage(data, str(msg.format), stamp, frame_id)
-    return images.RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
-                    bool(msg.is_bigendian), stamp, frame_id)
+    return images.RawImage(
+        data,
+        str(msg.encoding),
+        int(msg.width),
+        int(msg.height),
+        int(msg.step),
+        bool(msg.is_bigendian),
+        stamp,
+        frame_id,
+    )
 
 
 def pose_from_message(msg: Any) -> TruePose:
     """Pose of a geometry_msgs/PoseStamped."""
     position, q = msg.pose.position, msg.pose.orientation
-    return TruePose(stamp_ns(msg.header), (position.x, position.y, position.z),
-                    (q.x, q.y, q.z, q.w))
+    return TruePose(
+        stamp_ns(msg.header), (position.x, position.y, position.z), (q.x, q.y, q.z, q.w)
+    )
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
@@ -75,7 +84,8 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
             'the camera is uncalibrated (k[0] of its CameraInfo is 0): calibrate it and let its '
-            'driver publish the result, or give camera_matrix')
+            'driver publish the result, or give camera_matrix'
+        )
     pinhole = pinhole_of_matrix('k of CameraInfo', k)
     width, height = int(msg.width), int(msg.height)
     images.check_image_size(width, height)
@@ -84,12 +94,18 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     roi = msg.roi
     roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
     return Intrinsics(
-        width=width, height=height, **pinhole,
+        width=width,
+        height=height,
+        **pinhole,
         distortion_model=str(msg.distortion_model)[:40],
         distortion=tuple(float(value) for value in info_field(msg, 'd')),
-        x_offset=int(roi.x_offset), y_offset=int(roi.y_offset),
-        binning_x=binning_x, binning_y=binning_y,
-        image_width=roi_width // binning_x, image_height=roi_height // binning_y)
+        x_offset=int(roi.x_offset),
+        y_offset=int(roi.y_offset),
+        binning_x=binning_x,
+        binning_y=binning_y,
+        image_width=roi_width // binning_x,
+        image_height=roi_height // binning_y,
+    )
 
 
 def info_field(msg: Any, name: str) -> Any:
@@ -109,21 +125,43 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
         stamp, numbers = _imu_of_cdr(msg)
     else:
         q, w, f = msg.orientation, msg.angular_velocity, msg.linear_acceleration
-        stamp, numbers = stamp_ns(msg.header), (
-            q.x, q.y, q.z, q.w, *msg.orientation_covariance, w.x, w.y, w.z,
-            *msg.angular_velocity_covariance, f.x, f.y, f.z, *msg.linear_acceleration_covariance)
+        stamp, numbers = (
+            stamp_ns(msg.header),
+            (
+                q.x,
+                q.y,
+                q.z,
+                q.w,
+                *msg.orientation_covariance,
+                w.x,
+                w.y,
+                w.z,
+                *msg.angular_velocity_covariance,
+                f.x,
+                f.y,
+                f.z,
+                *msg.linear_acceleration_covariance,
+            ),
+        )
     # Each vector is followed by its covariance (3, 3).
     angular_velocity = linear_acceleration = None
     if with_gyro and numbers[16] != -1.0:
         angular_velocity = _vector('angular_velocity', numbers[13:16], MAX_ANGULAR_VELOCITY)
     if numbers[28] != -1.0 and any(numbers[25:28]):
-        linear_acceleration = _vector('linear_acceleration', numbers[25:28],
-                                      MAX_LINEAR_ACCELERATION)
+        linear_acceleration = _vector(
+            'linear_acceleration', numbers[25:28], MAX_LINEAR_ACCELERATION
+        )
     if angular_velocity is None and linear_acceleration is None:
-        raise InputError('an IMU message has neither gyro nor accelerometer: both are marked as '
-                         'absent (covariance -1) or zero')
-    return ImuSample(stamp, angular_velocity, linear_acceleration, None if angular_velocity is None
-                     else _orientation(numbers[:4], numbers[4], numbers[8]))
+        raise InputError(
+            'an IMU message has neither gyro nor accelerometer: both are marked as '
+            'absent (covariance -1) or zero'
+        )
+    return ImuSample(
+        stamp,
+        angular_velocity,
+        linear_acceleration,
+        None if angular_velocity is None else _orientation(numbers[:4], numbers[4], numbers[8]),
+    )
 
 
 # CDR of a header: kind and options of the encoding, stamp, size of frame_id with its end.
@@ -135,8 +173,8 @@ _IMU_NUMBERS = struct.Struct('<37d')
 
 def frame_id_of_cdr(data: bytes) -> str:
     """frame_id of the CDR of a message with a header; empty if it is too short."""
-    end = _HEADER.size + int.from_bytes(data[_HEADER.size - 4:_HEADER.size], 'little') - 1
-    return data[_HEADER.size:end].decode(errors='replace')
+    end = _HEADER.size + int.from_bytes(data[_HEADER.size - 4 : _HEADER.size], 'little') - 1
+    return data[_HEADER.size : end].decode(errors='replace')
 
 
 def stamp_of_cdr(data: bytes) -> int:
@@ -161,16 +199,21 @@ def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
         raise InputError(f'the CDR of an IMU message is too short: {error}') from None
 
 
-def _orientation(quat_xyzw: Sequence[float], first: float,
-                 second: float) -> tuple[float, float, float, float] | None:
+def _orientation(
+    quat_xyzw: Sequence[float], first: float, second: float
+) -> tuple[float, float, float, float] | None:
     """Down and its sigma; None without usable variances (0: unknown by REP-145)."""
     x, y, z, w = map(float, quat_xyzw)
     variance, norm2 = max(float(first), float(second)), x * x + y * y + z * z + w * w
     if not (first > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
         return None
     # Minus the third row of R(q), world from IMU.
-    return (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
-            -(w * w - x * x - y * y + z * z) / norm2, math.sqrt(variance))
+    return (
+        -2.0 * (x * z - w * y) / norm2,
+        -2.0 * (y * z + w * x) / norm2,
+        -(w * w - x * x - y * y + z * z) / norm2,
+        math.sqrt(variance),
+    )
 
 
 def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, float, float]:
@@ -178,18 +221,21 @@ def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, 
     if not all(map(math.isfinite, values)):
         raise InputError(f'{name} of an IMU message must be finite, got {list(values)}')
     if max(map(abs, values)) > largest:
-        raise InputError(f'{name} of an IMU message must be at most {largest:g}, '
-                         f'got {list(values)}: is it in rad/s and m/s^2?')
+        raise InputError(
+            f'{name} of an IMU message must be at most {largest:g}, '
+            f'got {list(values)}: is it in rad/s and m/s^2?'
+        )
     return values
 
 
 # -- Topics by role, live and offline -------------------------------------------------------------
 
+
 class Role(str, Enum):
     """Role of a topic: name of the topic of the node, and the field of `SensorTopics`."""
 
     IMU = 'imu'
-    ACCEL = 'accel'   # of drivers with a topic of its own for the accelerometer
+    ACCEL = 'accel'  # of drivers with a topic of its own for the accelerometer
     CAMERA_INFO = 'camera_info'
     IMAGE = 'image'
     TRUTH = 'truth'
@@ -206,8 +252,9 @@ PARTS: Mapping[Role, Part] = {
     Role.IMU: Part(('sensor_msgs/msg/Imu',), imu_sample_from_message),
     Role.ACCEL: Part(('sensor_msgs/msg/Imu',), partial(imu_sample_from_message, with_gyro=False)),
     Role.CAMERA_INFO: Part(('sensor_msgs/msg/CameraInfo',), intrinsics_from_info),
-    Role.IMAGE: Part(('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'),
-                     image_from_message),
+    Role.IMAGE: Part(
+        ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'), image_from_message
+    ),
     Role.TRUTH: Part(('geometry_msgs/msg/PoseStamped',), pose_from_message),
 }
 
@@ -216,11 +263,15 @@ PARTS: Mapping[Role, Part] = {
 SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
 
 
-def sensor_messages(bag: Any, topics: Any,
-                    roles: Collection[Role] = SENSOR_ROLES) -> Iterator[tuple[Role, Any]]:
+def sensor_messages(
+    bag: Any, topics: Any, roles: Collection[Role] = SENSOR_ROLES
+) -> Iterator[tuple[Role, Any]]:
     """Messages of a `Bag` with one of the roles, in bag order; `topics`: `SensorTopics`."""
-    found = {topic.name: (role, topic) for role in reversed(Role)
-             if role in roles and (topic := getattr(topics, role.value)) is not None}
+    found = {
+        topic.name: (role, topic)
+        for role in reversed(Role)
+        if role in roles and (topic := getattr(topics, role.value)) is not None
+    }
     for message in bag.messages([topic for _, topic in found.values()]):
         yield found[message.topic][0], message
 
@@ -244,9 +295,12 @@ _LEAST_CLIPPING = 0.2
 def repeats(previous: images.EncodedImage, image: images.EncodedImage) -> bool:
     """Whether an image is bit-equal to the one before, which no message delivered twice is."""
     first, second = previous.data, image.data
-    return (previous.stamp_ns != image.stamp_ns and len(first) == len(second)
-            and np.array_equal(first[::_STRIDE], second[::_STRIDE])
-            and np.array_equal(first, second))
+    return (
+        previous.stamp_ns != image.stamp_ns
+        and len(first) == len(second)
+        and np.array_equal(first[::_STRIDE], second[::_STRIDE])
+        and np.array_equal(first, second)
+    )
 
 
 class StuckGyro:
@@ -274,16 +328,25 @@ class StuckGyro:
                 self._counts[axis] = 0
             self._counts[axis] += 1
             self._largest[axis] = max(self._largest[axis], abs(value))
-        count, since_ns, fault = min(self._counts), max(self._since_ns), (
-            'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
-            'for a simulation without noise)')
+        count, since_ns, fault = (
+            min(self._counts),
+            max(self._since_ns),
+            (
+                'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time '
+                'to 0 '
+                'for a simulation without noise)'
+            ),
+        )
         if count == 1:
             for axis, value in enumerate(sample.angular_velocity):
                 if self._counts[axis] > 1 and abs(value) >= min(
-                        _LEAST_RANGE, max(_LEAST_CLIPPING, self._largest[axis])):
+                    _LEAST_RANGE, max(_LEAST_CLIPPING, self._largest[axis])
+                ):
                     count, since_ns = self._counts[axis], self._since_ns[axis]
-                    fault = (f'the {"xyz"[axis]} axis of the gyro repeats {value:.4g} rad/s bit '
-                             'by bit: it is saturated')
+                    fault = (
+                        f'the {"xyz"[axis]} axis of the gyro repeats {value:.4g} rad/s bit '
+                        'by bit: it is saturated'
+                    )
                     break
         if count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns:
             raise InputError(fault)
@@ -304,11 +367,15 @@ class Intake:
     Not thread-safe: one thread feeds it.
     """
 
-    def __init__(self, sequencer: Sequencer, parameters: Parameters | None = None,
-                 chosen: Collection[int] | None = None) -> None:
+    def __init__(
+        self,
+        sequencer: Sequencer,
+        parameters: Parameters | None = None,
+        chosen: Collection[int] | None = None,
+    ) -> None:
         self._sequencer = sequencer
         self._chosen = chosen
-        self.intrinsics: Intrinsics | None = None   # the active ones
+        self.intrinsics: Intrinsics | None = None  # the active ones
         # Why the last CameraInfo cannot be used; empty if it can, or if none came.
         self.camera_info_problem = ''
         # Images so far, those that were not chosen, and the chosen stamps so far.
@@ -317,7 +384,7 @@ class Intake:
         self._camera_info: Any = None
         configured = None if parameters is None else parameters.intrinsics
         self._configured = configured if configured is not None and configured.given else None
-        self._held: list[images.EncodedImage] = []   # wait for the first CameraInfo
+        self._held: list[images.EncodedImage] = []  # wait for the first CameraInfo
         self._last: images.EncodedImage | None = None
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
 
@@ -387,15 +454,20 @@ class Intake:
             return
         if self.intrinsics is None:
             self._sequencer.refuse(
-                image.stamp_ns, Refusal.NO_CALIBRATION,
-                self.camera_info_problem or 'no CameraInfo came before or with the image')
+                image.stamp_ns,
+                Refusal.NO_CALIBRATION,
+                self.camera_info_problem or 'no CameraInfo came before or with the image',
+            )
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
         before, self._last = self._last, image
         if before is not None and repeats(before, image):
             self._sequencer.refuse(
-                image.stamp_ns, Refusal.BAD_IMAGE, 'the image repeats the one before bit by bit: '
-                'the camera or its driver is stuck, or the image is empty')
+                image.stamp_ns,
+                Refusal.BAD_IMAGE,
+                'the image repeats the one before bit by bit: '
+                'the camera or its driver is stuck, or the image is empty',
+            )
         else:
             self._sequencer.add_frame(image, self.intrinsics)
 

@@ -27,16 +27,41 @@ from rs_relpose_ros.tracking.images import Pixels
 
 MessageTypes = Callable[[str], Any]
 
-_UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
+_UINT32, _FLOAT32 = 6, 7  # sensor_msgs/PointField
 
 # Floats first: `point_cloud2.read_points_numpy` reads only fields of the type of the first.
-MATCH_DTYPE = np.dtype([(name, '<f4') for name in (
-    'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2', 'x', 'y', 'z',
-    'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')] + [('id', '<u4')])
+MATCH_DTYPE = np.dtype(
+    [
+        (name, '<f4')
+        for name in (
+            'u1',
+            'v1',
+            'u2',
+            'v2',
+            'tau1',
+            'tau2',
+            'x1',
+            'y1',
+            'z1',
+            'x2',
+            'y2',
+            'z2',
+            'x',
+            'y',
+            'z',
+            'u1_gs',
+            'v1_gs',
+            'u2_gs',
+            'v2_gs',
+        )
+    ]
+    + [('id', '<u4')]
+)
 # Name, offset and type of each, for sensor_msgs/PointField.
 MATCH_FIELDS = tuple(
     (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
-    for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items())
+    for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items()
+)
 
 # Queue length of a pair topic: three seconds at 30 Hz.
 PAIR_HISTORY = 100
@@ -63,6 +88,7 @@ _LEAST_EIGENVALUE = 1e-14
 
 # -- ~/pairs: the keys of a status, for writing here and for reading in `published_pair` ---------
 
+
 class PairValue(NamedTuple):
     """A key of the status of a pair; `field`: of `PublishedPair`, if it has the value."""
 
@@ -88,10 +114,11 @@ class PairValue(NamedTuple):
             # At most the digits of an int64.
             if not (text.isascii() and text.isdigit() and len(text) < 20):
                 raise InputError(
-                    f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}')
+                    f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}'
+                )
             return int(text)
         try:
-            values = [float(word) for word in text[:2000].split()]   # the longest list has 66
+            values = [float(word) for word in text[:2000].split()]  # the longest list has 66
         except ValueError:
             values = []
         if text and not (values and all(map(math.isfinite, values))):
@@ -107,50 +134,71 @@ class PairValue(NamedTuple):
 
 def _image_value(key: str, of: Callable[[ImageInformation], ArrayLike]) -> PairValue:
     """Part of the images' estimate; none if it is not known."""
+
     def part(pair: PairResult) -> Array | None:
         numbers = np.nan if pair.pose.images is None else of(pair.pose.images)
         return np.atleast_1d(numbers) if np.isfinite(numbers).all() else None
+
     return PairValue(key, 'reals', part)
 
 
 # `TOPICS_KEY` follows: the other topics of the pair.
-PAIR_VALUES = {value.key: value for value in (
-    PairValue('reference_stamp_ns', 'time', lambda pair: pair.reference_stamp_ns,
-              'reference_stamp_ns'),
-    PairValue('status', 'text', lambda pair: pair.pose.status.value, 'status'),
-    PairValue('reason', 'text', lambda pair: pair.pose.reason, 'reason'),
-    PairValue('model', 'text', lambda pair: pair.pose.model),
-    *(PairValue(metric.name, 'real', metric.of) for metric in PAIR_METRICS),
-    PairValue('baseline_m', 'real', lambda pair: pair.pose.baseline, 'baseline'),
-    PairValue('baseline_log_sigma', 'real', lambda pair: pair.pose.baseline_log_sigma,
-              'baseline_log_sigma'),
-    PairValue('baseline_reason', 'text', lambda pair: pair.pose.baseline_reason),
-    # Of the current camera in its own frame.
-    PairValue('linear_velocity_m_s', 'vector', lambda pair: (
-        pair.pose.metric_velocity2 if math.isfinite(pair.pose.baseline) else None)),
-    # Times of the two stamped rows on the IMU's clock.
-    PairValue('reference_imu_ns', 'time', lambda pair: pair.reference_ns1, 'reference_imu_ns'),
-    PairValue('current_imu_ns', 'time', lambda pair: pair.reference_ns2, 'current_imu_ns'),
-    # `ImageInformation`: the estimate of the images without the priors of the IMU.
-    _image_value('image_row_s', lambda images: images.row_time),
-    _image_value('image_rotation_xyzw',
-                 lambda images: Rotation.from_matrix(images.R).as_quat()),
-    _image_value('image_direction', lambda images: images.t),
-    _image_value('image_velocities', lambda images: images.velocities),
-    _image_value('image_gradient', lambda images: images.gradient),
-    _image_value('image_information',
-                 lambda images: images.information[np.triu_indices(len(images.gradient))]),
-    PairValue('gyro_bias_rad_s', 'vector', lambda pair: pair.gyro_bias, 'gyro_bias'),
-    PairValue('health', 'text', lambda pair: pair.health.state.value, 'health'),
-    PairValue('health_findings', 'text', lambda pair: pair.health.text),
-)}
+PAIR_VALUES = {
+    value.key: value
+    for value in (
+        PairValue(
+            'reference_stamp_ns',
+            'time',
+            lambda pair: pair.reference_stamp_ns,
+            'reference_stamp_ns',
+        ),
+        PairValue('status', 'text', lambda pair: pair.pose.status.value, 'status'),
+        PairValue('reason', 'text', lambda pair: pair.pose.reason, 'reason'),
+        PairValue('model', 'text', lambda pair: pair.pose.model),
+        *(PairValue(metric.name, 'real', metric.of) for metric in PAIR_METRICS),
+        PairValue('baseline_m', 'real', lambda pair: pair.pose.baseline, 'baseline'),
+        PairValue(
+            'baseline_log_sigma',
+            'real',
+            lambda pair: pair.pose.baseline_log_sigma,
+            'baseline_log_sigma',
+        ),
+        PairValue('baseline_reason', 'text', lambda pair: pair.pose.baseline_reason),
+        # Of the current camera in its own frame.
+        PairValue(
+            'linear_velocity_m_s',
+            'vector',
+            lambda pair: pair.pose.metric_velocity2 if math.isfinite(pair.pose.baseline) else None,
+        ),
+        # Times of the two stamped rows on the IMU's clock.
+        PairValue('reference_imu_ns', 'time', lambda pair: pair.reference_ns1, 'reference_imu_ns'),
+        PairValue('current_imu_ns', 'time', lambda pair: pair.reference_ns2, 'current_imu_ns'),
+        # `ImageInformation`: the estimate of the images without the priors of the IMU.
+        _image_value('image_row_s', lambda images: images.row_time),
+        _image_value(
+            'image_rotation_xyzw', lambda images: Rotation.from_matrix(images.R).as_quat()
+        ),
+        _image_value('image_direction', lambda images: images.t),
+        _image_value('image_velocities', lambda images: images.velocities),
+        _image_value('image_gradient', lambda images: images.gradient),
+        _image_value(
+            'image_information',
+            lambda images: images.information[np.triu_indices(len(images.gradient))],
+        ),
+        PairValue('gyro_bias_rad_s', 'vector', lambda pair: pair.gyro_bias, 'gyro_bias'),
+        PairValue('health', 'text', lambda pair: pair.health.state.value, 'health'),
+        PairValue('health_findings', 'text', lambda pair: pair.health.text),
+    )
+}
 TOPICS_KEY = 'topics'
 
 
 # -- the messages of a pair ------------------------------------------------------------------
 
-def pair_parts(result: PairResult, types: MessageTypes,
-               reference_frame: str = '') -> dict[str, Callable[[], Any]]:
+
+def pair_parts(
+    result: PairResult, types: MessageTypes, reference_frame: str = ''
+) -> dict[str, Callable[[], Any]]:
     """Functions that make the messages of a pair, by topic, in the order of `PAIR_TOPICS`.
 
     Every pair has `pairs`, every known rotation `relative_rotation`, every pose all of them: no
@@ -162,27 +210,45 @@ def pair_parts(result: PairResult, types: MessageTypes,
     in_reference = header(stamp_ns, reference_frame or f'{result.frame_id}_reference', types)
     # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
     # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
-    parts = {} if not pose else {
-        'relative_pose': lambda: types('geometry_msgs/msg/PoseWithCovarianceStamped')(
-            header=in_reference, pose=types('geometry_msgs/msg/PoseWithCovariance')(
-                pose=_pose(pose.R, pose.t, types),
-                covariance=published_covariance(pose.covariance))),
-        'reference': lambda: types('sensor_msgs/msg/TimeReference')(
-            header=in_camera, time_ref=_time(result.reference_stamp_ns, types),
-            source='reference_keyframe'),
-        # Of the current camera: angular in rad/s, linear in baselines per second.
-        'velocity': lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
-            header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
-                                                  pose.velocity_covariance, types)),
-        'matches': lambda: _matches_message(inlier_records(result), in_reference, types)}
+    parts = (
+        {}
+        if not pose
+        else {
+            'relative_pose': lambda: types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+                header=in_reference,
+                pose=types('geometry_msgs/msg/PoseWithCovariance')(
+                    pose=_pose(pose.R, pose.t, types),
+                    covariance=published_covariance(pose.covariance),
+                ),
+            ),
+            'reference': lambda: types('sensor_msgs/msg/TimeReference')(
+                header=in_camera,
+                time_ref=_time(result.reference_stamp_ns, types),
+                source='reference_keyframe',
+            ),
+            # Of the current camera: angular in rad/s, linear in baselines per second.
+            'velocity': lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+                header=in_camera,
+                twist=twist_message(
+                    pose.linear_velocity2, pose.angular_velocity2, pose.velocity_covariance, types
+                ),
+            ),
+            'matches': lambda: _matches_message(inlier_records(result), in_reference, types),
+        }
+    )
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
         # ``~/relative_pose``; the rates are those of ``~/velocity``.
         parts['relative_rotation'] = lambda: imu_message(
-            stamp_ns, in_reference.frame_id, pose.angular_velocity2, None, types,
+            stamp_ns,
+            in_reference.frame_id,
+            pose.angular_velocity2,
+            None,
+            types,
             angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
             orientation=quat_xyzw(pose.R),
-            orientation_covariance=published_covariance(pose.covariance[3:, 3:]))
+            orientation_covariance=published_covariance(pose.covariance[3:, 3:]),
+        )
     topics = ' '.join(parts)
     parts['pairs'] = lambda: _status_of_pair(result, topics, types)
     return parts
@@ -197,21 +263,30 @@ def _status_of_pair(result: PairResult, topics: str, types: MessageTypes) -> Any
         level = 2
     else:
         level = 0 if pose and result.health.state is not FindingState.SUSPECT else 1
-    return diagnostics_message(result.stamp_ns, level, 'keyframe pair', text, result.frame_id,
-                               values, types)
+    return diagnostics_message(
+        result.stamp_ns, level, 'keyframe pair', text, result.frame_id, values, types
+    )
 
 
 def _matches_message(points: NDArray[np.void], in_reference: Any, types: MessageTypes) -> Any:
     """sensor_msgs/PointCloud2 of `inlier_records`, with landmarks in the frame of the header."""
     field_type = types('sensor_msgs/msg/PointField')
-    fields = [field_type(name=name, offset=offset, datatype=datatype, count=1)
-              for name, offset, datatype in MATCH_FIELDS]
+    fields = [
+        field_type(name=name, offset=offset, datatype=datatype, count=1)
+        for name, offset, datatype in MATCH_FIELDS
+    ]
     message_type = types('sensor_msgs/msg/PointCloud2')
     return message_type(
-        header=in_reference, height=1, width=len(points),
-        fields=fields, is_bigendian=False, point_step=MATCH_DTYPE.itemsize,
-        row_step=MATCH_DTYPE.itemsize * len(points), data=_byte_data(points, message_type),
-        is_dense=not np.isnan(points['x']).any())
+        header=in_reference,
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=MATCH_DTYPE.itemsize,
+        row_step=MATCH_DTYPE.itemsize * len(points),
+        data=_byte_data(points, message_type),
+        is_dense=not np.isnan(points['x']).any(),
+    )
 
 
 def inlier_records(result: PairResult) -> NDArray[np.void]:
@@ -226,16 +301,23 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
     records['id'] = result.matches.track_ids[inliers]
     for names, values in (
-            ('u1 v1', result.matches.points1), ('u2 v2', result.matches.points2),
-            ('tau1', result.row_times1[:, None]), ('tau2', result.row_times2[:, None]),
-            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2), ('x y z', found.points),
-            ('u1_gs v1_gs', found.pixels1), ('u2_gs v2_gs', found.pixels2)):
+        ('u1 v1', result.matches.points1),
+        ('u2 v2', result.matches.points2),
+        ('tau1', result.row_times1[:, None]),
+        ('tau2', result.row_times2[:, None]),
+        ('x1 y1 z1', result.rays1),
+        ('x2 y2 z2', result.rays2),
+        ('x y z', found.points),
+        ('u1_gs v1_gs', found.pixels1),
+        ('u2_gs v2_gs', found.pixels2),
+    ):
         for column, name in enumerate(names.split()):
             records[name] = values[inliers, column]
     return records
 
 
 # -- messages of any kind --------------------------------------------------------------------
+
 
 def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
     """std_msgs/Header."""
@@ -248,40 +330,60 @@ def geometry_message(name: str, values: ArrayLike, types: MessageTypes) -> Any:
     return types(f'geometry_msgs/msg/{name}')(**fields)
 
 
-def pose_stamped_message(stamp_ns: int, frame_id: str, rotation: ArrayLike, position: ArrayLike,
-                         types: MessageTypes) -> Any:
+def pose_stamped_message(
+    stamp_ns: int, frame_id: str, rotation: ArrayLike, position: ArrayLike, types: MessageTypes
+) -> Any:
     """geometry_msgs/PoseStamped; `rotation`: a matrix (3, 3) or a quaternion x, y, z, w."""
     return types('geometry_msgs/msg/PoseStamped')(
-        header=header(stamp_ns, frame_id, types), pose=_pose(rotation, position, types))
+        header=header(stamp_ns, frame_id, types), pose=_pose(rotation, position, types)
+    )
 
 
-def transform_message(stamp_ns: int, frame_id: str, child_frame_id: str, rotation: ArrayLike,
-                      position: ArrayLike, types: MessageTypes) -> Any:
+def transform_message(
+    stamp_ns: int,
+    frame_id: str,
+    child_frame_id: str,
+    rotation: ArrayLike,
+    position: ArrayLike,
+    types: MessageTypes,
+) -> Any:
     """geometry_msgs/TransformStamped from the pose of the child, as `pose_stamped_message`."""
     pose = pose_stamped_message(stamp_ns, frame_id, rotation, position, types)
     return types('geometry_msgs/msg/TransformStamped')(
-        header=pose.header, child_frame_id=child_frame_id,
+        header=pose.header,
+        child_frame_id=child_frame_id,
         transform=types('geometry_msgs/msg/Transform')(
             translation=geometry_message('Vector3', position, types),
-            rotation=pose.pose.orientation))
+            rotation=pose.pose.orientation,
+        ),
+    )
 
 
-def twist_message(linear: ArrayLike, angular: ArrayLike, covariance: Array,
-                  types: MessageTypes) -> Any:
+def twist_message(
+    linear: ArrayLike, angular: ArrayLike, covariance: Array, types: MessageTypes
+) -> Any:
     """geometry_msgs/TwistWithCovariance."""
     return types('geometry_msgs/msg/TwistWithCovariance')(
         twist=types('geometry_msgs/msg/Twist')(
             linear=geometry_message('Vector3', linear, types),
-            angular=geometry_message('Vector3', angular, types)),
-        covariance=published_covariance(covariance))
+            angular=geometry_message('Vector3', angular, types),
+        ),
+        covariance=published_covariance(covariance),
+    )
 
 
-def imu_message(stamp_ns: int, frame_id: str, angular_velocity: ArrayLike | None,
-                linear_acceleration: ArrayLike | None, types: MessageTypes, *,
-                angular_velocity_covariance: Array | None = None,
-                linear_acceleration_covariance: Array | None = None,
-                orientation: ArrayLike | None = None,
-                orientation_covariance: Array | None = None) -> Any:
+def imu_message(
+    stamp_ns: int,
+    frame_id: str,
+    angular_velocity: ArrayLike | None,
+    linear_acceleration: ArrayLike | None,
+    types: MessageTypes,
+    *,
+    angular_velocity_covariance: Array | None = None,
+    linear_acceleration_covariance: Array | None = None,
+    orientation: ArrayLike | None = None,
+    orientation_covariance: Array | None = None,
+) -> Any:
     """sensor_msgs/Imu (REP-145).
 
     Rates (3,) [rad/s] and specific force (3,) [m/s^2], +g up at rest, in the frame; None is an
@@ -290,15 +392,19 @@ def imu_message(stamp_ns: int, frame_id: str, angular_velocity: ArrayLike | None
     """
     fields = {}
     for name, kind, value, covariance in (
-            ('orientation', 'Quaternion', orientation, orientation_covariance),
-            ('angular_velocity', 'Vector3', angular_velocity, angular_velocity_covariance),
-            ('linear_acceleration', 'Vector3', linear_acceleration,
-             linear_acceleration_covariance)):
+        ('orientation', 'Quaternion', orientation, orientation_covariance),
+        ('angular_velocity', 'Vector3', angular_velocity, angular_velocity_covariance),
+        ('linear_acceleration', 'Vector3', linear_acceleration, linear_acceleration_covariance),
+    ):
         absent = (0.0, 0.0, 0.0, 1.0) if kind == 'Quaternion' else (0.0, 0.0, 0.0)
         fields[name] = geometry_message(kind, absent if value is None else value, types)
         fields[f'{name}_covariance'] = (
-            np.diag([-1.0, 0.0, 0.0]).ravel() if value is None
-            else np.zeros(9) if covariance is None else np.ravel(covariance))
+            np.diag([-1.0, 0.0, 0.0]).ravel()
+            if value is None
+            else np.zeros(9)
+            if covariance is None
+            else np.ravel(covariance)
+        )
     return types('sensor_msgs/msg/Imu')(header=header(stamp_ns, frame_id, types), **fields)
 
 
@@ -307,13 +413,19 @@ def image_message(stamp_ns: int, frame_id: str, pixels: Pixels, types: MessageTy
     values = np.ascontiguousarray(pixels.values)
     message_type = types('sensor_msgs/msg/Image')
     return message_type(
-        header=header(stamp_ns, frame_id, types), height=values.shape[0], width=values.shape[1],
-        encoding=pixels.encoding, is_bigendian=int(sys.byteorder == 'big'),
-        step=values[0].nbytes, data=_byte_data(values, message_type))
+        header=header(stamp_ns, frame_id, types),
+        height=values.shape[0],
+        width=values.shape[1],
+        encoding=pixels.encoding,
+        is_bigendian=int(sys.byteorder == 'big'),
+        step=values[0].nbytes,
+        data=_byte_data(values, message_type),
+    )
 
 
-def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, png: bool,
-                             types: MessageTypes) -> Any:
+def compressed_image_message(
+    stamp_ns: int, frame_id: str, pixels: Pixels, *, png: bool, types: MessageTypes
+) -> Any:
     """sensor_msgs/CompressedImage: JPEG, or PNG, the only one for 16 bits."""
     kind, data = encode_pixels(pixels, png=png)
     values, name = pixels
@@ -326,25 +438,39 @@ def encode_pixels(pixels: Pixels, *, png: bool) -> tuple[str, bytes]:
     """Kind, 'jpeg' or 'png', and content of a file; 16 bits are always PNG."""
     values, name = pixels
     if name.startswith('rgb'):
-        values = cv2.cvtColor(values, cv2.COLOR_RGBA2BGRA if name == 'rgba8'
-                              else cv2.COLOR_RGB2BGR)
+        values = cv2.cvtColor(
+            values, cv2.COLOR_RGBA2BGRA if name == 'rgba8' else cv2.COLOR_RGB2BGR
+        )
     kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
-    _, data = cv2.imencode(f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-                           if kind == 'jpeg' else [])
+    _, data = cv2.imencode(
+        f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == 'jpeg' else []
+    )
     return kind, data.tobytes()
 
 
-def encoded_image_message(stamp_ns: int, frame_id: str, data: bytes | NDArray[np.uint8],
-                          types: MessageTypes,
-                          image_format: str = 'mono8; jpeg compressed ') -> Any:
+def encoded_image_message(
+    stamp_ns: int,
+    frame_id: str,
+    data: bytes | NDArray[np.uint8],
+    types: MessageTypes,
+    image_format: str = 'mono8; jpeg compressed ',
+) -> Any:
     """sensor_msgs/CompressedImage of JPEG or PNG data; `image_format` as of image_transport."""
     message_type = types('sensor_msgs/msg/CompressedImage')
-    return message_type(header=header(stamp_ns, frame_id, types), format=image_format,
-                        data=_byte_data(np.frombuffer(data, dtype=np.uint8), message_type))
+    return message_type(
+        header=header(stamp_ns, frame_id, types),
+        format=image_format,
+        data=_byte_data(np.frombuffer(data, dtype=np.uint8), message_type),
+    )
 
 
-def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | RollingShutterCamera,
-                        published: Any, types: MessageTypes) -> Any:
+def camera_info_message(
+    stamp_ns: int,
+    frame_id: str,
+    camera: Intrinsics | RollingShutterCamera,
+    published: Any,
+    types: MessageTypes,
+) -> Any:
     """sensor_msgs/CameraInfo: that of `published` (ROS 1 or 2), or of the full sensor for None."""
     if published is None:
         model, binning, region = camera.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
@@ -353,8 +479,12 @@ def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | Rolli
         p[:, :3] = pinhole.camera_matrix
         # Without distortion ROS writes five zeros.
         d = camera.distortion or (0.0,) * (5 if model == 'plumb_bob' else 0)
-        arrays = {'d': d, 'k': pinhole.camera_matrix.ravel(), 'r': np.eye(3).ravel(),
-                  'p': p.ravel()}
+        arrays = {
+            'd': d,
+            'k': pinhole.camera_matrix.ravel(),
+            'r': np.eye(3).ravel(),
+            'p': p.ravel(),
+        }
     else:
         arrays = {name: info_field(published, name) for name in 'dkrp'}
         model = published.distortion_model
@@ -362,22 +492,41 @@ def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | Rolli
         region = {name: int(getattr(published.roi, name)) for name in _REGION}
         region['do_rectify'] = bool(published.roi.do_rectify)
     return types('sensor_msgs/msg/CameraInfo')(
-        header=header(stamp_ns, frame_id, types), height=camera.height, width=camera.width,
-        distortion_model=model, binning_x=binning[0], binning_y=binning[1],
+        header=header(stamp_ns, frame_id, types),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=model,
+        binning_x=binning[0],
+        binning_y=binning[1],
         roi=types('sensor_msgs/msg/RegionOfInterest')(**{'do_rectify': False, **region}),
-        **{name: np.array(values, dtype=np.float64) for name, values in arrays.items()})
+        **{name: np.array(values, dtype=np.float64) for name, values in arrays.items()},
+    )
 
 
-def diagnostics_message(stamp_ns: int, level: int, name: str, text: str, hardware_id: str,
-                        values: Sequence[tuple[str, str]], types: MessageTypes) -> Any:
+def diagnostics_message(
+    stamp_ns: int,
+    level: int,
+    name: str,
+    text: str,
+    hardware_id: str,
+    values: Sequence[tuple[str, str]],
+    types: MessageTypes,
+) -> Any:
     """diagnostic_msgs/DiagnosticArray of one status; level 0 OK, 1 warning, 2 error, 3 stale."""
     key_value = types('diagnostic_msgs/msg/KeyValue')
     status_type = types('diagnostic_msgs/msg/DiagnosticStatus')
     return types('diagnostic_msgs/msg/DiagnosticArray')(
-        header=header(stamp_ns, '', types), status=[status_type(
-            level=bytes([level]) if _is_rclpy(status_type) else level, name=name, message=text,
-            hardware_id=hardware_id,
-            values=[key_value(key=key, value=value) for key, value in values])])
+        header=header(stamp_ns, '', types),
+        status=[
+            status_type(
+                level=bytes([level]) if _is_rclpy(status_type) else level,
+                name=name,
+                message=text,
+                hardware_id=hardware_id,
+                values=[key_value(key=key, value=value) for key, value in values],
+            )
+        ],
+    )
 
 
 def quat_xyzw(R: Array) -> Array:
@@ -410,7 +559,8 @@ def _pose(rotation: ArrayLike, position: ArrayLike, types: MessageTypes) -> Any:
     quaternion = quat_xyzw(np.asarray(rotation)) if np.ndim(rotation) == 2 else rotation
     return types('geometry_msgs/msg/Pose')(
         position=geometry_message('Point', position, types),
-        orientation=geometry_message('Quaternion', quaternion, types))
+        orientation=geometry_message('Quaternion', quaternion, types),
+    )
 
 
 def _byte_data(values: NDArray[Any], message_type: Any) -> Any:
@@ -437,8 +587,10 @@ _CAPTION_HEIGHT = 24
 _OUTLIER = (255, 255, 0)
 _WHITE = (255, 255, 255)
 # From the first row to the last one (216, 3).
-_COLORS = np.asarray(cv2.applyColorMap(
-    np.arange(40, 256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0], dtype=np.uint8)
+_COLORS = np.asarray(
+    cv2.applyColorMap(np.arange(40, 256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0],
+    dtype=np.uint8,
+)
 # Fractional bits of the coordinates that OpenCV draws at.
 _SHIFT = 4
 
@@ -457,12 +609,13 @@ def draw_pair(result: PairResult) -> Color:
     canvas = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     points1, points2 = result.matches.points1, result.matches.points2
     inliers = result.pose.inliers
-    if len(inliers) != len(points1):   # a pair without an estimate has none
+    if len(inliers) != len(points1):  # a pair without an estimate has none
         inliers = np.zeros(len(points1), dtype=bool)
     colors = _COLORS[(points2[:, 1] / height * len(_COLORS)).astype(int)].tolist()
     # Pixel centres lie at integer coordinates.
-    ends = np.round(((np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5)
-                    * (1 << _SHIFT)).astype(int)
+    ends = np.round(
+        ((np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5) * (1 << _SHIFT)
+    ).astype(int)
     for (start, end), inlier, color in zip(ends.tolist(), inliers, colors, strict=True):
         color = color if inlier else _OUTLIER
         cv2.line(canvas, start, end, color, 1, cv2.LINE_AA, _SHIFT)
@@ -471,13 +624,30 @@ def draw_pair(result: PairResult) -> Color:
         canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
         times = np.polyval(np.polyfit(points2[:, 1], result.row_times2, 1), (0, height - 1))
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
-            cv2.putText(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y),
-                        cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
+            cv2.putText(
+                canvas,
+                f'{round(1e3 * time, 1) + 0.0:.1f} ms',
+                (_BAR_WIDTH + 4, y),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.42,
+                _WHITE,
+                1,
+                cv2.LINE_AA,
+            )
     pose = result.pose
-    model, residual = (f' {pose.model}', f', residual {pose.residual_rms:.2f} px') if pose else (
-        '', '')
+    model, residual = (
+        (f' {pose.model}', f', residual {pose.residual_rms:.2f} px') if pose else ('', '')
+    )
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
-    cv2.putText(caption, f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
-                f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}',
-                (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
+    cv2.putText(
+        caption,
+        f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
+        f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}',
+        (6, 16),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.42,
+        _WHITE,
+        1,
+        cv2.LINE_AA,
+    )
     return np.concatenate([canvas, caption])

@@ -38,26 +38,26 @@ class PublishedPair:
     without a pose.
     """
 
-    reference_stamp_ns: int   # header stamp of the reference keyframe
-    stamp_ns: int   # of the current image, as frame_id
+    reference_stamp_ns: int  # header stamp of the reference keyframe
+    stamp_ns: int  # of the current image, as frame_id
     frame_id: str
-    reference_imu_ns: int   # times of the two stamped rows on the IMU's clock
+    reference_imu_ns: int  # times of the two stamped rows on the IMU's clock
     current_imu_ns: int
-    status: str   # as of `Status`
-    reason: str   # of a pair without a pose; else empty
+    status: str  # as of `Status`
+    reason: str  # of a pair without a pose; else empty
     has_pose: bool
-    R: Array   # (3, 3)
-    t: Array   # (3,), of length 1: the scale of two views is not observable
-    covariance: Array   # (6, 6); without a pose the part of R is known
-    linear_velocity: Array   # (3,), of the current camera in its own frame [baselines per second]
-    angular_velocity: Array   # (3,), likewise [rad/s]
-    velocity_covariance: Array   # (6, 6), of the two
-    baseline: float   # [m]
-    baseline_log_sigma: float   # 1 sigma of its logarithm
-    gyro_bias: Array   # (3,) [rad/s] that was removed, in the axes of the IMU
-    images: ImageInformation | None   # estimate of the images alone
-    health: str   # consistency of the calibration, as of `FindingState`
-    matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
+    R: Array  # (3, 3)
+    t: Array  # (3,), of length 1: the scale of two views is not observable
+    covariance: Array  # (6, 6); without a pose the part of R is known
+    linear_velocity: Array  # (3,), of the current camera in its own frame [baselines per second]
+    angular_velocity: Array  # (3,), likewise [rad/s]
+    velocity_covariance: Array  # (6, 6), of the two
+    baseline: float  # [m]
+    baseline_log_sigma: float  # 1 sigma of its logarithm
+    gyro_bias: Array  # (3,) [rad/s] that was removed, in the axes of the IMU
+    images: ImageInformation | None  # estimate of the images alone
+    health: str  # consistency of the calibration, as of `FindingState`
+    matches: NDArray[np.void]  # (N,), of MATCH_DTYPE
 
     def __bool__(self) -> bool:
         """Whether there is a pose."""
@@ -93,36 +93,51 @@ class PairStatus:
         size = len(gradient)
         if size == 0:
             return None
-        row_times, xyzw, t, velocities, upper = (self[f'image_{name}'] for name in (
-            'row_s', 'rotation_xyzw', 'direction', 'velocities', 'information'))
+        row_times, xyzw, t, velocities, upper = (
+            self[f'image_{name}']
+            for name in ('row_s', 'rotation_xyzw', 'direction', 'velocities', 'information')
+        )
         rows = np.triu_indices(size)
         has_direction = len(t) == 3 and len(velocities) == 6 and _is_unit(t)
-        if not ((size == ROTATION or (size == POSE and has_direction))
-                and len(upper) == len(rows[0])
-                and len(row_times) == 1 and abs(row_times[0]) < 1.0
-                and len(xyzw) == 4 and _is_unit(xyzw)):
-            raise InputError('image_information of ~/pairs and the other keys image_* must be of '
-                             f'{POSE} or {ROTATION} unknowns, got {size}')
+        if not (
+            (size == ROTATION or (size == POSE and has_direction))
+            and len(upper) == len(rows[0])
+            and len(row_times) == 1
+            and abs(row_times[0]) < 1.0
+            and len(xyzw) == 4
+            and _is_unit(xyzw)
+        ):
+            raise InputError(
+                'image_information of ~/pairs and the other keys image_* must be of '
+                f'{POSE} or {ROTATION} unknowns, got {size}'
+            )
         H = np.zeros((size, size))
         H[rows] = H.T[rows] = upper
         values = np.linalg.eigvalsh(H)
-        if not -_LEAST_INFORMATION * values[-1] <= values[0] <= values[-1] or \
-                not 0.0 < values[-1] < _MOST_INFORMATION:
-            raise InputError('image_information of ~/pairs must be positive semidefinite, with '
-                             f'eigenvalues below {_MOST_INFORMATION:g}, got {values[0]:.3g} to '
-                             f'{values[-1]:.3g}: the pair is not used')
+        if (
+            not -_LEAST_INFORMATION * values[-1] <= values[0] <= values[-1]
+            or not 0.0 < values[-1] < _MOST_INFORMATION
+        ):
+            raise InputError(
+                'image_information of ~/pairs must be positive semidefinite, with '
+                f'eigenvalues below {_MOST_INFORMATION:g}, got {values[0]:.3g} to '
+                f'{values[-1]:.3g}: the pair is not used'
+            )
         if size == ROTATION:
             t, velocities = np.full(3, math.nan), np.full(6, math.nan)
-        return ImageInformation(float(row_times[0]), Rotation.from_quat(xyzw).as_matrix(), t,
-                                velocities, H, gradient)
+        return ImageInformation(
+            float(row_times[0]), Rotation.from_quat(xyzw).as_matrix(), t, velocities, H, gradient
+        )
 
     def topics(self) -> set[str]:
         """Topics of the pair, ``~/pairs`` included."""
         text = self._text(outgoing.TOPICS_KEY)
         topics, with_rotation = set(text.split()), {'relative_rotation'}
         if topics not in (set(), with_rotation, with_rotation.union(outgoing.POSE_TOPICS)):
-            raise InputError(f'{outgoing.TOPICS_KEY} of ~/pairs must name all others, '
-                             f'relative_rotation, or none, got {text[:100]!r}')
+            raise InputError(
+                f'{outgoing.TOPICS_KEY} of ~/pairs must name all others, '
+                f'relative_rotation, or none, got {text[:100]!r}'
+            )
         return topics | {'pairs'}
 
 
@@ -135,7 +150,7 @@ class PairSynchronizer:
 
     def __init__(self, capacity: int = 10) -> None:
         self._capacity = validate.number('capacity', capacity, 1)
-        self._waiting: dict[int, dict[str, Any]] = {}   # stamp -> messages by topic
+        self._waiting: dict[int, dict[str, Any]] = {}  # stamp -> messages by topic
         self.given_up = 0
 
     def add(self, topic: str, message: Any) -> PublishedPair | None:
@@ -165,8 +180,9 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
     status = PairStatus(messages['pairs'])
     topics = status.topics()
     if stamps.keys() != topics:
-        raise InputError(f'~/pairs lists {" ".join(sorted(topics))}, but there are '
-                         f'{" ".join(sorted(stamps))}')
+        raise InputError(
+            f'~/pairs lists {" ".join(sorted(topics))}, but there are {" ".join(sorted(stamps))}'
+        )
     fields = {value.field: status[key] for key, value in PAIR_VALUES.items() if value.field}
     if 'relative_pose' in messages:
         if time_ns(messages['reference'].time_ref) != fields['reference_stamp_ns']:
@@ -177,10 +193,12 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
             't': _unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
             'covariance': _covariance('~/relative_pose', pose.covariance, 6),
             'linear_velocity': _velocity('the linear velocity of ~/velocity', twist.twist.linear),
-            'angular_velocity': _velocity('the angular velocity of ~/velocity',
-                                          twist.twist.angular),
+            'angular_velocity': _velocity(
+                'the angular velocity of ~/velocity', twist.twist.angular
+            ),
             'velocity_covariance': _covariance('~/velocity', twist.covariance, 6),
-            'matches': match_records(messages['matches'])}
+            'matches': match_records(messages['matches']),
+        }
     else:
         covariances = np.full((2, 6, 6), math.nan)
         R, angular_velocity = np.full((3, 3), math.nan), np.full(3, math.nan)
@@ -188,13 +206,26 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
             imu, topic = messages['relative_rotation'], '~/relative_rotation'
             R = _rotation(topic, imu.orientation)
             angular_velocity = _velocity(f'the angular velocity of {topic}', imu.angular_velocity)
-            covariances[:, 3:, 3:] = [_covariance(topic, block, 3) for block in (
-                imu.orientation_covariance, imu.angular_velocity_covariance)]
-        fields |= {'R': R, 't': np.full(3, math.nan), 'covariance': covariances[0],
-                   'linear_velocity': np.full(3, math.nan), 'angular_velocity': angular_velocity,
-                   'velocity_covariance': covariances[1], 'matches': np.empty(0, MATCH_DTYPE)}
-    return PublishedPair(stamp_ns=stamps['pairs'], images=status.images(),
-                         frame_id=status.frame_id, has_pose='relative_pose' in messages, **fields)
+            covariances[:, 3:, 3:] = [
+                _covariance(topic, block, 3)
+                for block in (imu.orientation_covariance, imu.angular_velocity_covariance)
+            ]
+        fields |= {
+            'R': R,
+            't': np.full(3, math.nan),
+            'covariance': covariances[0],
+            'linear_velocity': np.full(3, math.nan),
+            'angular_velocity': angular_velocity,
+            'velocity_covariance': covariances[1],
+            'matches': np.empty(0, MATCH_DTYPE),
+        }
+    return PublishedPair(
+        stamp_ns=stamps['pairs'],
+        images=status.images(),
+        frame_id=status.frame_id,
+        has_pose='relative_pose' in messages,
+        **fields,
+    )
 
 
 def match_records(cloud: Any) -> NDArray[np.void]:
@@ -206,17 +237,22 @@ def match_records(cloud: Any) -> NDArray[np.void]:
         raise InputError(
             f'~/matches must have the fields {" ".join(MATCH_DTYPE.names or ())}, little endian, '
             f'{MATCH_DTYPE.itemsize} bytes a point; got {names or "none"}, '
-            f'{"big" if cloud.is_bigendian else "little"} endian, {int(cloud.point_step)} bytes')
+            f'{"big" if cloud.is_bigendian else "little"} endian, {int(cloud.point_step)} bytes'
+        )
     data = np.frombuffer(cloud.data, dtype=np.uint8)
     count = int(cloud.width) * int(cloud.height)
     if len(data) != count * MATCH_DTYPE.itemsize:
-        raise InputError(f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
-                         f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}')
+        raise InputError(
+            f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
+            f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}'
+        )
     records = data.view(MATCH_DTYPE)
     # A match without a landmark has NaN in x, y and z.
     far = np.isnan(records['x']) & np.isnan(records['y']) & np.isnan(records['z'])
-    if not all((np.isfinite(records[name]) | (far & (name in ('x', 'y', 'z')))).all()
-               for name in MATCH_DTYPE.names or ()):
+    if not all(
+        (np.isfinite(records[name]) | (far & (name in ('x', 'y', 'z')))).all()
+        for name in MATCH_DTYPE.names or ()
+    ):
         raise InputError('~/matches must be finite')
     for view in '12':
         rays = np.stack([records[axis + view].astype(np.float64) for axis in 'xyz'])
@@ -233,11 +269,11 @@ def _unit(name: str, message: Any, axes: str) -> Array:
 
 
 def _is_unit(values: Array) -> bool:
-    return abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE   # not NaN
+    return abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE  # not NaN
 
 
 def _velocity(name: str, vector: Any) -> Array:
-    largest = 1e9   # [baselines/s, rad/s]: above any camera, below an overflow
+    largest = 1e9  # [baselines/s, rad/s]: above any camera, below an overflow
     return validate.array(name, [vector.x, vector.y, vector.z], (3,), largest=largest)
 
 
@@ -266,8 +302,8 @@ class PathPose:
     """A camera of the path, in the axes of the chain: those of its first camera."""
 
     stamp_ns: int
-    R: Array   # (3, 3)
-    position: Array   # (3,), in baselines of the path's first pair with a pose
+    R: Array  # (3, 3)
+    position: Array  # (3,), in baselines of the path's first pair with a pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,11 +316,11 @@ class PathStep:
     """
 
     poses: tuple[PathPose, ...]
-    new_path: str   # empty if the path continues, or none begins
-    new_axes: bool   # whether the axes are unrelated to the former, too
-    scale: float   # the pair's baseline, in baselines of the path's first; NaN without a pose
-    shared_tracks: int   # for the scale relative to the last pair with a pose
-    scale_sigma: float   # 1 sigma of that ratio, relative; NaN without one
+    new_path: str  # empty if the path continues, or none begins
+    new_axes: bool  # whether the axes are unrelated to the former, too
+    scale: float  # the pair's baseline, in baselines of the path's first; NaN without a pose
+    shared_tracks: int  # for the scale relative to the last pair with a pose
+    scale_sigma: float  # 1 sigma of that ratio, relative; NaN without one
 
 
 class PoseChain:
@@ -320,8 +356,7 @@ class PoseChain:
         """Append a pair, to the path or as the first of a new one."""
         if self._R is not None and pair.reference_stamp_ns != self._stamp_ns:
             self._end('a pair is missing', new_axes=True)
-        scale, shared_tracks, sigma = (
-            self._rescaled(pair) if pair else (math.nan, 0, math.nan))
+        scale, shared_tracks, sigma = self._rescaled(pair) if pair else (math.nan, 0, math.nan)
         if not pair.rotation_known:
             self._end(f'a pair has no rotation ({pair.status})', new_axes=True)
             return PathStep((), '', False, scale, shared_tracks, sigma)
@@ -335,7 +370,7 @@ class PoseChain:
             self._position = np.zeros(3)
             poses.append(PathPose(pair.reference_stamp_ns, start, self._position))
             new_path, new_axes, self._new_axes = self._reason, self._new_axes, False
-        movement = scale * pair.t if pair else np.zeros(3)   # in the reference camera
+        movement = scale * pair.t if pair else np.zeros(3)  # in the reference camera
         self._position = self._position + start @ movement
         poses.append(PathPose(pair.stamp_ns, self._R, self._position))
         return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, sigma)
@@ -343,8 +378,12 @@ class PoseChain:
     def _rescaled(self, pair: PublishedPair) -> tuple[float, int, float]:
         """Scale of a pair with a pose, its shared tracks, and the relative sigma of the ratio."""
         distances1, distances2 = track_distances(pair)
-        ratios = np.array([self._distances[track] / distances1[track]
-                           for track in distances1.keys() & self._distances.keys()])
+        ratios = np.array(
+            [
+                self._distances[track] / distances1[track]
+                for track in distances1.keys() & self._distances.keys()
+            ]
+        )
         if self._scale is not None and len(ratios) < self._min_shared_tracks:
             self._end(f'{len(ratios)} shared tracks, the scale needs {self._min_shared_tracks}')
         self._distances = distances2
@@ -355,7 +394,7 @@ class PoseChain:
         self._scale *= median
         # Median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
         scatter = float(np.median(np.abs(ratios - median))) / median
-        return self._scale, len(ratios), 1.2533 * 1.4826 * scatter / len(ratios)**0.5
+        return self._scale, len(ratios), 1.2533 * 1.4826 * scatter / len(ratios) ** 0.5
 
     def _end(self, reason: str, *, new_axes: bool = False) -> None:
         """End the path, with its axes if these are `new`; the first reason is the next path's."""
@@ -380,5 +419,7 @@ def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, fl
     baselines = pair.t + tau[:, None] * (pair.R @ pair.linear_velocity)
     l1, l2, usable = depths_of_rays(f1, f2, baselines, _PARALLEL)
     tracks = m['id'][usable].tolist()
-    return (dict(zip(tracks, l1[usable].tolist(), strict=True)),
-            dict(zip(tracks, l2[usable].tolist(), strict=True)))
+    return (
+        dict(zip(tracks, l1[usable].tolist(), strict=True)),
+        dict(zip(tracks, l2[usable].tolist(), strict=True)),
+    )

@@ -41,8 +41,9 @@ class FrameTree:
             if abs(np.linalg.norm(quaternion) - 1.0) < 1e-2 and np.isfinite(pose).all():
                 pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
                 # ROS 1 has names with and without a slash.
-                self._parents.setdefault(stamped.child_frame_id.lstrip('/'), (
-                    stamped.header.frame_id.lstrip('/'), pose))
+                self._parents.setdefault(
+                    stamped.child_frame_id.lstrip('/'), (stamped.header.frame_id.lstrip('/'), pose)
+                )
 
     def lookup(self, parent: str, child: str) -> Transform | None:
         """Pose of `child` in `parent`; None if they are not connected."""
@@ -54,7 +55,7 @@ class FrameTree:
 
     def _in_root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
         frame, pose = frame.lstrip('/'), np.eye(4)
-        for _ in self._parents:   # at most: a circle has no root
+        for _ in self._parents:  # at most: a circle has no root
             if frame in self._parents:
                 frame, step = self._parents[frame]
                 pose = step @ pose
@@ -67,25 +68,32 @@ def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: flo
     return math.degrees(angle) if angle > math.hypot(AXES_SIGMA, 3.0 * sigma) else 0.0
 
 
-def extrinsics(parameters: Parameters, found: Transform, camera: str,
-               imu: str) -> tuple[dict[str, Any], str]:
+def extrinsics(
+    parameters: Parameters, found: Transform, camera: str, imu: str
+) -> tuple[dict[str, Any], str]:
     """Parameters by the pose `found` of the IMU in the camera, or a contradiction."""
     sensor, position = parameters.sensor, parameters.imu.imu_position
     rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
     if sensor.quat_cam_imu_xyzw is None:
-        values = {'quat_cam_imu_xyzw': tuple(map(float, rotation.as_quat())),
-                  'axes_sigma': AXES_SIGMA}
+        values = {
+            'quat_cam_imu_xyzw': tuple(map(float, rotation.as_quat())),
+            'axes_sigma': AXES_SIGMA,
+        }
     elif angle := angle_between(rotation.as_matrix(), sensor.R_cam_imu, sensor.axes_sigma):
-        return {}, (f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
-                    f'{_text(sensor.quat_cam_imu_xyzw)}, {angle:.1f} deg apart: the parameter is '
-                    'used, and nothing of the transform')
+        return {}, (
+            f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
+            f'{_text(sensor.quat_cam_imu_xyzw)}, {angle:.1f} deg apart: the parameter is '
+            'used, and nothing of the transform'
+        )
     if not any(position):
         return values | {'imu_position': found[:3], 'imu_position_sigma': POSITION_SIGMA}, ''
     apart = float(np.abs(np.subtract(found[:3], position)).max())
     if apart > 3.0 * math.hypot(POSITION_SIGMA, parameters.imu.imu_position_sigma):
-        return values, (f'{head} at {_text(found[:3])} m, imu_position is {_text(position)} m: '
-                        'the parameter is used')
+        return values, (
+            f'{head} at {_text(found[:3])} m, imu_position is {_text(position)} m: '
+            'the parameter is used'
+        )
     return values, ''
 
 
@@ -94,6 +102,7 @@ def _text(values: tuple[float, ...]) -> str:
 
 
 # -- Bags -----------------------------------------------------------------------------------------
+
 
 class BagFrames(NamedTuple):
     """Frames of a bag: names of camera and IMU, '' if unknown, and the transforms."""
@@ -111,15 +120,27 @@ class BagFrames(NamedTuple):
 
 def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
     """Frames of a `Bag` with `SensorTopics`; of /tf if /tf_static does not suffice (`base`)."""
-    camera, imu = (next((str(message.message.header.frame_id).lstrip('/') for message
-                         in bag.messages([topic])), '') if topic is not None else ''
-                   for topic in (topics.image, topics.imu))
+    camera, imu = (
+        next(
+            (
+                str(message.message.header.frame_id).lstrip('/')
+                for message in bag.messages([topic])
+            ),
+            '',
+        )
+        if topic is not None
+        else ''
+        for topic in (topics.image, topics.imu)
+    )
     frames = BagFrames(camera, imu, FrameTree())
     for name, most in (('/tf_static', None), ('/tf', _MOST_MESSAGES)):
         found = [topic for topic in bag.topics if topic.name == name and topic.msgtype == TF_TYPE]
         for message in islice(bag.messages(found), most):
-            if most is not None and frames.imu_in_camera is not None and (
-                    not base or frames.tree.lookup(base, camera) is not None):
+            if (
+                most is not None
+                and frames.imu_in_camera is not None
+                and (not base or frames.tree.lookup(base, camera) is not None)
+            ):
                 break
             frames.tree.add(message.message)
     return frames
@@ -131,10 +152,16 @@ def with_extrinsics(bag: Any, topics: Any, parameters: Parameters) -> tuple[Para
     if not parameters.calibration.use_tf:
         return parameters, ''
     frames = bag_frames(bag, topics, base)
-    values, contradiction = ({}, '') if (found := frames.imu_in_camera) is None else (
-        extrinsics(parameters, found, frames.camera, frames.imu))
-    if base and parameters.odometry.base_to_camera is None and (
-            found := frames.tree.lookup(base, frames.camera)):
+    values, contradiction = (
+        ({}, '')
+        if (found := frames.imu_in_camera) is None
+        else (extrinsics(parameters, found, frames.camera, frames.imu))
+    )
+    if (
+        base
+        and parameters.odometry.base_to_camera is None
+        and (found := frames.tree.lookup(base, frames.camera))
+    ):
         values['base_to_camera'] = found
     if values:
         _logger.info('from /tf_static: %s', ', '.join(values))

@@ -47,7 +47,7 @@ class Silence:
     seconds: float = 0.0
     images: int = 0
     refused: Mapping[Refusal, int] = field(default_factory=dict)
-    failure: str = ''   # reason of the last pair or frame without a result
+    failure: str = ''  # reason of the last pair or frame without a result
 
 
 class Reason(NamedTuple):
@@ -60,16 +60,17 @@ class Reason(NamedTuple):
 def why_no_image(image: str, published: Collection[str]) -> Reason:
     """Reason for no image on a topic; `published`: image topics that have a publisher."""
     kind = f'no image on {image}'
-    twin = (image.removesuffix(_COMPRESSED) if image.endswith(_COMPRESSED)
-            else image + _COMPRESSED)
+    twin = image.removesuffix(_COMPRESSED) if image.endswith(_COMPRESSED) else image + _COMPRESSED
     if image in published:
         fix = 'it has a publisher: does its quality of service match, and does the driver run?'
     elif twin in published:
         transport = 'compressed' if twin.endswith(_COMPRESSED) else 'raw'
         fix = f'only {twin} is published: set image_transport:={transport}'
     elif published:
-        fix = (f'these topics with images have publishers: {", ".join(sorted(published))}; '
-               'remap image')
+        fix = (
+            f'these topics with images have publishers: {", ".join(sorted(published))}; '
+            'remap image'
+        )
     else:
         fix = 'no topic with images has a publisher: is the camera driver running?'
     return Reason(kind, f'{kind} for {PATIENCE:g} s; {fix}')
@@ -80,12 +81,18 @@ def why_nothing(silence: Silence) -> Reason:
     refused = sum(silence.refused.values())
     if refused >= _MOST * silence.images:
         refusal = max(silence.refused, key=lambda kind: silence.refused[kind])
-        return Reason(f'refused: {refusal.value}', (
-            f'nothing for {PATIENCE:g} s: {refused} of {silence.images} images were refused, '
-            f'{silence.refused[refusal]} of them as {refusal.value}'))
+        return Reason(
+            f'refused: {refusal.value}',
+            (
+                f'nothing for {PATIENCE:g} s: {refused} of {silence.images} images were refused, '
+                f'{silence.refused[refusal]} of them as {refusal.value}'
+            ),
+        )
     if silence.failure:
-        return Reason(silence.failure.partition(':')[0],
-                      f'nothing for {PATIENCE:g} s; the last reason: {silence.failure}')
+        return Reason(
+            silence.failure.partition(':')[0],
+            f'nothing for {PATIENCE:g} s; the last reason: {silence.failure}',
+        )
     return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
 
 
@@ -94,8 +101,9 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
 
     `stamps_ns`: of the recent images; `size`: of an image [bytes].
     """
-    recent = np.array([stamp for stamp in stamps_ns
-                       if stamp > stamps_ns[-1] - PATIENCE * NANOSECONDS])
+    recent = np.array(
+        [stamp for stamp in stamps_ns if stamp > stamps_ns[-1] - PATIENCE * NANOSECONDS]
+    )
     if len(recent) < _FEWEST:
         return ''
     steps = np.diff(recent) / NANOSECONDS
@@ -103,11 +111,13 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
     period = max(float(np.quantile(steps, 0.25, method='lower')), 1e-9)
     sent = 1e-9 * (recent[-1] - recent[0]) / period + 1.0
     if size >= _BIG and len(recent) < _LOST * sent:
-        return (f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
-                f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. '
-                'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
-                '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
-                'rs_relpose_ros relpose.launch.py does it for the node')
+        return (
+            f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
+            f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. '
+            'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
+            '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
+            'rs_relpose_ros relpose.launch.py does it for the node'
+        )
     shares = steps / max(float(np.median(steps)), 1e-9)
     whole = steps[(shares > 0.0) & (shares < MISSING)]
     # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
@@ -115,9 +125,11 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
     jitter = spread / 2.56 / math.sqrt(2.0)
     if jitter < _JITTER or correlation_of_steps(shares) > _ALTERNATING:
         return ''
-    return (f'the stamps of the images jitter by {1e3 * jitter:.1f} ms rms, as times of arrival '
-            'do: a pose is wrong by the rotation within that time. Let the driver stamp by the '
-            'clock of the sensor')
+    return (
+        f'the stamps of the images jitter by {1e3 * jitter:.1f} ms rms, as times of arrival '
+        'do: a pose is wrong by the rotation within that time. Let the driver stamp by the '
+        'clock of the sensor'
+    )
 
 
 # -- Fields of /diagnostics -----------------------------------------------------------------------
@@ -144,7 +156,7 @@ class Report:
     level: int
     text: str
     values: tuple[tuple[str, str], ...]
-    silence: Silence   # ends with a result
+    silence: Silence  # ends with a result
 
 
 # Counters of `SequencerCounts`.
@@ -168,7 +180,8 @@ _TRACKED: dict[str, Callable[[Tracked, Applied], str]] = {
     'applied_time_offset_ms': lambda _, applied: _ms(applied.time_offset),
     'tracked_readout_time_ms': lambda tracked, _: _ms(tracked.readout_time),
     'tracked_readout_time_sigma_ms': lambda tracked, _: _ms(tracked.readout_time_sigma),
-    'applied_readout_time_ms': lambda _, applied: _ms(applied.readout_time)}
+    'applied_readout_time_ms': lambda _, applied: _ms(applied.readout_time),
+}
 
 
 class FrameStatistics(ABC):
@@ -179,7 +192,7 @@ class FrameStatistics(ABC):
 
     # States without results, and with a configured parameter that is wrong.
     idle, wrong = 'not working', 'told wrong'
-    last = 'last_failure'   # key of the last failure
+    last = 'last_failure'  # key of the last failure
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
@@ -188,7 +201,7 @@ class FrameStatistics(ABC):
         self._failures = 0
         self._last_failure = self._last_refusal = ''
         self._since_ns = clock()
-        self._taken = 0   # frames, until the last report
+        self._taken = 0  # frames, until the last report
         self._counted: Counter[str] = Counter()
         self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
@@ -219,9 +232,16 @@ class FrameStatistics(ABC):
         with self._lock:
             self._last_refusal = reason
 
-    def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
-               missing: tuple[str, ...], progress: Progress | None = None,
-               warning: str = '') -> Report:
+    def report(
+        self,
+        inputs: Counter[str],
+        counts: SequencerCounts | None,
+        *,
+        problem: str,
+        missing: tuple[str, ...],
+        progress: Progress | None = None,
+        warning: str = '',
+    ) -> Report:
         """The state since the last report.
 
         `inputs` are the numbers of messages so far, by role, and of the invalid ones. `counts` is
@@ -240,17 +260,23 @@ class FrameStatistics(ABC):
             used, self._taken = taken - self._taken, taken
             if not problem and dropped and used <= 0:
                 problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
-            level, text = (self._evaluate(problem, dropped) if progress is None
-                           else (OK, progress.text))
+            level, text = (
+                self._evaluate(problem, dropped) if progress is None else (OK, progress.text)
+            )
             if warning and level == OK:
                 level, text = WARN, warning
             values: dict[str, object] = {
-                'state': self.idle if problem else {
-                    OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
-                'missing': ', '.join(missing)}
+                'state': self.idle
+                if problem
+                else {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
+                'missing': ', '.join(missing),
+            }
             if progress is not None:
-                values.update(state='calibrating', progress=f'{100.0 * progress.share:.0f}',
-                              **progress.values)
+                values.update(
+                    state='calibrating',
+                    progress=f'{100.0 * progress.share:.0f}',
+                    **progress.values,
+                )
             for role in TOPICS:
                 rate = (inputs[role] - before[role]) / elapsed
                 values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
@@ -268,8 +294,9 @@ class FrameStatistics(ABC):
             values['worker_busy_percent'] = f'{100.0 * busy:.0f}'
             values[self.last] = self._last_failure
             silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
-        return Report(level, text, tuple((name, str(value)) for name, value in values.items()),
-                      silence)
+        return Report(
+            level, text, tuple((name, str(value)) for name, value in values.items()), silence
+        )
 
     def _silence(self, now_ns: int, images: int, refused: Counter[Refusal]) -> Silence:
         # Without an image there can be no result.
@@ -277,8 +304,12 @@ class FrameStatistics(ABC):
             self._results_reported = self._results
             self._silent_since = (now_ns, images, refused)
         since_ns, images_before, refused_before = self._silent_since
-        return Silence((now_ns - since_ns) / NANOSECONDS, images - images_before,
-                       refused - refused_before, self._last_failure)
+        return Silence(
+            (now_ns - since_ns) / NANOSECONDS,
+            images - images_before,
+            refused - refused_before,
+            self._last_failure,
+        )
 
     def _evaluate(self, problem: str, dropped: Counter[Refusal]) -> tuple[int, str]:
         if problem:
@@ -354,12 +385,14 @@ class Statistics(FrameStatistics):
         if last is not None and last.tracked is not None and last.tracked.pairs:
             tracked = {name: text(last.tracked, last.applied) for name, text in _TRACKED.items()}
         return {
-            'pairs': self._pairs, 'poses': self._poses,
+            'pairs': self._pairs,
+            'poses': self._poses,
             **{metric.name: metric.text(last) for metric in PAIR_METRICS},
             'model': pose.pose.model if pose else '',
             **tracked,
             'health': (NOT_EVALUATED if last is None else last.health).state.value,
-            'health_findings': (NOT_EVALUATED if last is None else last.health).text}
+            'health_findings': (NOT_EVALUATED if last is None else last.health).text,
+        }
 
 
 # -- Files with a line per frame ------------------------------------------------------------------
@@ -373,12 +406,14 @@ class LineFile:
     It ends with an error, as of a full disk, which `report` gets; the node continues.
     """
 
-    def __init__(self, parameter: str, path: str,
-                 report: Callable[[str], object] = lambda text: None) -> None:
+    def __init__(
+        self, parameter: str, path: str, report: Callable[[str], object] = lambda text: None
+    ) -> None:
         self._name, self._report = f'{parameter} {path}', report
         try:
-            self._file: TextIO | None = Path(path).open(   # noqa: SIM115 closed by close
-                'w', buffering=1, encoding='ascii')
+            self._file: TextIO | None = Path(path).open(  # noqa: SIM115 closed by close
+                'w', buffering=1, encoding='ascii'
+            )
         except OSError as error:
             raise InputError(f'{self._name} cannot be written: {error.strerror}') from error
 
@@ -391,7 +426,7 @@ class LineFile:
             file.write(f'{line}\n')
         except OSError as error:
             self._file = None
-            with suppress(OSError):   # of what is left to be written
+            with suppress(OSError):  # of what is left to be written
                 file.close()
             self._report(f'{self._name} ends here: {error.strerror}')
 
@@ -423,12 +458,15 @@ class FrameTimings:
         """Write a frame; call it right after its result was published."""
         done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
         outcome = 'none' if frame.result is None else frame.result.pose.status.value
-        self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
-                         f'{spent_ns - self._spent_ns},{outcome}')
+        self._file.write(
+            f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
+            f'{spent_ns - self._spent_ns},{outcome}'
+        )
         self._spent_ns = spent_ns
 
 
 # -- Log lines once per reason, repetitions now and then with their number ------------------------
+
 
 class ReasonLog:
     """Passes a text to `write` unless one of its kind came in the last `period` [s]; thread-safe.
@@ -436,8 +474,12 @@ class ReasonLog:
     `clock`: monotonic [s]; set by tests.
     """
 
-    def __init__(self, write: Callable[[str], object], period: float = 30.0,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        write: Callable[[str], object],
+        period: float = 30.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._write = write
         self._period = period
         self._clock = clock
@@ -462,11 +504,13 @@ class ReasonLog:
 
 # -- Log of the calibration consistency -----------------------------------------------------------
 
+
 class HealthLog:
     """Logs findings after each result; at most a line per parameter and period of the logs."""
 
-    def __init__(self, info: ReasonLog, warn: ReasonLog, error: ReasonLog,
-                 results: str = 'poses') -> None:
+    def __init__(
+        self, info: ReasonLog, warn: ReasonLog, error: ReasonLog, results: str = 'poses'
+    ) -> None:
         self._info, self._warn, self._error, self._results = info, warn, error, results
         self._reported_faults = False
 
@@ -480,13 +524,23 @@ class HealthLog:
                 # A gross error has a fix of its own, unlike the first small steps.
                 kind += ', gross'
             if health.state is FindingState.WRONG:
-                self._error(f'{text}; ' + (
-                    f'{self._results} are suppressed: withhold_when_wrong: false publishes them '
-                    'all the same' if withhold else f'{self._results} are published all the same, '
-                    'as withhold_when_wrong is false'), kind)
+                self._error(
+                    f'{text}; '
+                    + (
+                        f'{self._results} are suppressed: withhold_when_wrong: false publishes '
+                        f'them '
+                        'all the same'
+                        if withhold
+                        else f'{self._results} are published all the same, '
+                        'as withhold_when_wrong is false'
+                    ),
+                    kind,
+                )
             else:
                 self._warn(text, kind)
         elif self._reported_faults:
-            self._info(f'health is {health.state.value}: no configured parameter is suspect or '
-                       'wrong any more')
+            self._info(
+                f'health is {health.state.value}: no configured parameter is suspect or '
+                'wrong any more'
+            )
         self._reported_faults = bool(faults)

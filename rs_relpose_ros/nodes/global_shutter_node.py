@@ -40,15 +40,21 @@ _DESCRIPTION = (
     'camera_info, imu, accel,\n            calibration, /diagnostics\n'
     'publishes:  ~/image, ~/image/compressed and ~/mask, each while it is subscribed,\n'
     '            ~/camera_info, /diagnostics\n'
-    'service:    ~/reset')
+    'service:    ~/reset'
+)
 
 
 def assessment_of(status: Any) -> Assessment:
     """Findings of a status of relpose_node on /diagnostics."""
     texts = {item.key: item.value for item in status.values}.get('health_findings', '')
-    return Assessment(tuple(
-        Finding(quantity, FindingState(state), message) for quantity, state, message in re.findall(
-            rf'(\w+) ({"|".join(FindingState)}): ([^;]*)', texts)))
+    return Assessment(
+        tuple(
+            Finding(quantity, FindingState(state), message)
+            for quantity, state, message in re.findall(
+                rf'(\w+) ({"|".join(FindingState)}): ([^;]*)', texts
+            )
+        )
+    )
 
 
 class _Statistics(FrameStatistics):
@@ -62,8 +68,15 @@ class _Statistics(FrameStatistics):
         self._last: global_shutter.GlobalShutterFrame | None = None
         self._health, self._source = NOT_EVALUATED, ''
 
-    def add_image(self, frame: global_shutter.GlobalShutterFrame, ready_ns: int,
-                  health: Assessment, source: str, *, withheld: bool) -> None:
+    def add_image(
+        self,
+        frame: global_shutter.GlobalShutterFrame,
+        ready_ns: int,
+        health: Assessment,
+        source: str,
+        *,
+        withheld: bool,
+    ) -> None:
         """Count an image right after its publication; its data were complete at `ready_ns`.
 
         `source`: the node that made the assessment `health`.
@@ -81,18 +94,23 @@ class _Statistics(FrameStatistics):
 
     def _values(self) -> dict[str, object]:
         last = self._last
-        return {'images_published': self._images, 'images_withheld': self._withheld,
-                'health': self._health.state.value, 'health_source': self._source,
-                'largest_shift_px': '' if last is None else f'{last.map.shift:.1f}',
-                'applied_time_offset_ms': '' if last is None else
-                f'{1e-6 * last.applied_offset_ns:.2f}'}
+        return {
+            'images_published': self._images,
+            'images_withheld': self._withheld,
+            'health': self._health.state.value,
+            'health_source': self._source,
+            'largest_shift_px': '' if last is None else f'{last.map.shift:.1f}',
+            'applied_time_offset_ms': ''
+            if last is None
+            else f'{1e-6 * last.applied_offset_ns:.2f}',
+        }
 
 
 class GlobalShutterNode(SensorNode):
     """Publishes each derotated image with a CameraInfo of the same stamp."""
 
     task = 'global shutter'
-    calibrates = False   # relpose_node does, from the same images
+    calibrates = False  # relpose_node does, from the same images
 
     def __init__(self) -> None:
         self._statistics = _Statistics()
@@ -104,18 +122,28 @@ class GlobalShutterNode(SensorNode):
     def _open_outputs(self, parameters: Parameters) -> None:
         def publisher(msgtype: str, topic: str) -> Any:
             return self.create_publisher(
-                message_class(msgtype), topic, QoSProfile(depth=_DEPTH),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies())
+                message_class(msgtype),
+                topic,
+                QoSProfile(depth=_DEPTH),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+
         self._image, self._compressed, self._mask, self._camera_info = (
-            publisher(f'sensor_msgs/msg/{name}', f'~/{topic}') for name, topic in (
-                ('Image', 'image'), ('CompressedImage', 'image/compressed'), ('Image', 'mask'),
-                ('CameraInfo', 'camera_info')))
+            publisher(f'sensor_msgs/msg/{name}', f'~/{topic}')
+            for name, topic in (
+                ('Image', 'image'),
+                ('CompressedImage', 'image/compressed'),
+                ('Image', 'mask'),
+                ('CameraInfo', 'camera_info'),
+            )
+        )
         self._images, self._camera_infos = Serialised(), Serialised()
         self._log_health = HealthLog(self._info, self._warn, self._error, 'images')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
         return global_shutter.unrolling_loop(
-            parameters, watched=lambda: self._by_relpose() is None)
+            parameters, watched=lambda: self._by_relpose() is None
+        )
 
     def _warm_up(self) -> None:
         global_shutter.warm_up_unroller(self._settings.current)
@@ -140,33 +168,53 @@ class GlobalShutterNode(SensorNode):
         """Keep the state of relpose_node on the same images."""
         own = self._image_topic().removesuffix('/compressed')
         for status in message.status:
-            if (status.name.endswith(f': {RELATIVE_POSE}')
-                    and status.hardware_id.removesuffix('/compressed') == own):
-                self._of_others = (time.monotonic(), assessment_of(status),
-                                   status.name.partition(':')[0])
+            if (
+                status.name.endswith(f': {RELATIVE_POSE}')
+                and status.hardware_id.removesuffix('/compressed') == own
+            ):
+                self._of_others = (
+                    time.monotonic(),
+                    assessment_of(status),
+                    status.name.partition(':')[0],
+                )
 
     def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""
         stamp_ns, frame_id, intrinsics = frame.stamp_ns, frame.frame_id, frame.intrinsics
-        raw, compressed, mask = (topic.get_subscription_count() for topic in (
-            self._image, self._compressed, self._mask))
+        raw, compressed, mask = (
+            topic.get_subscription_count() for topic in (self._image, self._compressed, self._mask)
+        )
         if raw or compressed:
             pixels = frame.image()
             if raw:
-                self._image.publish(self._images(
-                    stamp_ns, (frame_id, pixels.values.shape, pixels.encoding), partial(
-                        outgoing.image_message, 0, frame_id, pixels, message_class),
-                    pixels.values.tobytes()))
+                self._image.publish(
+                    self._images(
+                        stamp_ns,
+                        (frame_id, pixels.values.shape, pixels.encoding),
+                        partial(outgoing.image_message, 0, frame_id, pixels, message_class),
+                        pixels.values.tobytes(),
+                    )
+                )
             if compressed:
-                self._compressed.publish(outgoing.compressed_image_message(
-                    stamp_ns, frame_id, pixels, png=frame.is_png, types=message_class))
+                self._compressed.publish(
+                    outgoing.compressed_image_message(
+                        stamp_ns, frame_id, pixels, png=frame.is_png, types=message_class
+                    )
+                )
         published = self._intake.camera_info_of(intrinsics)
-        self._camera_info.publish(self._camera_infos(
-            stamp_ns, (frame_id, intrinsics, published), partial(
-                outgoing.camera_info_message, 0, frame_id, intrinsics, published, message_class)))
+        self._camera_info.publish(
+            self._camera_infos(
+                stamp_ns,
+                (frame_id, intrinsics, published),
+                partial(
+                    outgoing.camera_info_message, 0, frame_id, intrinsics, published, message_class
+                ),
+            )
+        )
         if mask:
-            self._mask.publish(outgoing.image_message(
-                stamp_ns, frame_id, frame.mask(), message_class))
+            self._mask.publish(
+                outgoing.image_message(stamp_ns, frame_id, frame.mask(), message_class)
+            )
 
 
 main = partial(run_node, GlobalShutterNode, NAME, _DESCRIPTION)

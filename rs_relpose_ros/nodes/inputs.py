@@ -53,7 +53,7 @@ class KeptWaitSet(SingleThreadedExecutor):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._in_use = ExitStack()   # handles that must not be destroyed
+        self._in_use = ExitStack()  # handles that must not be destroyed
         self._wait_set: Any = None
         self._events_at = 0.0
 
@@ -81,12 +81,15 @@ class KeptWaitSet(SingleThreadedExecutor):
         wait_set.wait(0 if waiting else -1)
         if not self.context.ok():
             raise ExternalShutdownException
-        if (waiting or wait_set.get_ready_entities('guard_condition')
-                or wait_set.get_ready_entities('service')
-                or any(event.is_ready(wait_set) for event in events)):
+        if (
+            waiting
+            or wait_set.get_ready_entities('guard_condition')
+            or wait_set.get_ready_entities('service')
+            or any(event.is_ready(wait_set) for event in events)
+        ):
             self.release()
             super().spin_once(0.0)
-            self._cb_iter = None   # forget what else was ready
+            self._cb_iter = None  # forget what else was ready
             return
         ready = wait_set.get_ready_entities('timer')
         for timer in self._timers if ready else ():
@@ -106,17 +109,27 @@ class KeptWaitSet(SingleThreadedExecutor):
         self._wait_set = None
 
     def _list_entities(self) -> None:
-        node, = self.get_nodes()
+        (node,) = self.get_nodes()
         self._timers, self._services = [*node.timers], [*node.services]
         self._subscriptions, self._events = [*node.subscriptions], [*node.waitables]
-        handled: Any = (*self._timers, *self._services, *self._subscriptions, self._guard,
-                        self.context)
+        handled: Any = (
+            *self._timers,
+            *self._services,
+            *self._subscriptions,
+            self._guard,
+            self.context,
+        )
         for used in (*(entity.handle for entity in handled), *self._events):
             self._in_use.enter_context(used)
         self._wait_set = rclpy_implementation.WaitSet(
-            len(self._subscriptions), 1, len(self._timers), 0, len(self._services),
+            len(self._subscriptions),
+            1,
+            len(self._timers),
+            0,
+            len(self._services),
             sum(event.get_num_entities().num_events for event in self._events),
-            self.context.handle)
+            self.context.handle,
+        )
 
 
 # Most messages that are taken at once, so that other callbacks get their turn.
@@ -133,21 +146,30 @@ class PolledSubscription:
     hold the messages between two calls of `drain`.
     """
 
-    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile,
-                 receive: Callable[[list[Any]], None], urgent: Callable[[], bool],
-                 **options: Any) -> None:
+    def __init__(
+        self,
+        node: Node,
+        msgtype: type,
+        topic: str,
+        qos: QoSProfile,
+        receive: Callable[[list[Any]], None],
+        urgent: Callable[[], bool],
+        **options: Any,
+    ) -> None:
         self._receive = receive
         self._subscription = node.create_subscription(
-            msgtype, topic, self.drain, qos, callback_group=_WhileUrgent(urgent),
-            **options)
+            msgtype, topic, self.drain, qos, callback_group=_WhileUrgent(urgent), **options
+        )
 
     def drain(self, *received: Any) -> None:
         """Receive all messages of the queue, after those that the executor has taken from it."""
         subscription, messages = self._subscription, [*received]
         with subscription.handle:
             take = subscription.handle.take_message
-            while (len(messages) < _MOST_AT_ONCE and (taken := take(
-                    subscription.msg_type, subscription.raw)) is not None):
+            while (
+                len(messages) < _MOST_AT_ONCE
+                and (taken := take(subscription.msg_type, subscription.raw)) is not None
+            ):
                 messages.append(taken[0])
         if messages:
             self._receive(messages)
@@ -183,8 +205,9 @@ def message_class(msgtype: str) -> Any:
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except (ImportError, AttributeError):
-        raise MissingInputError(f'message type {msgtype} is not installed; install its package, '
-                                'or choose other topics') from None
+        raise MissingInputError(
+            f'message type {msgtype} is not installed; install its package, or choose other topics'
+        ) from None
 
 
 class Serialised:
@@ -197,14 +220,20 @@ class Serialised:
         self._key: Any = None
         self._bytes = b''
 
-    def __call__(self, stamp_ns: int, key: Any, make: Callable[[], Any],
-                 end: bytes = b'') -> bytes:
+    def __call__(
+        self, stamp_ns: int, key: Any, make: Callable[[], Any], end: bytes = b''
+    ) -> bytes:
         """The message that `make` returns for another `key` than before, with `end` at its end."""
         if key != self._key:
             self._key, self._bytes = key, serialize_message(make())
-        return b''.join((
-            self._bytes[:_STAMP], struct.pack('=iI', *divmod(stamp_ns, NANOSECONDS)),
-            self._bytes[_STAMPED:len(self._bytes) - len(end)], end))
+        return b''.join(
+            (
+                self._bytes[:_STAMP],
+                struct.pack('=iI', *divmod(stamp_ns, NANOSECONDS)),
+                self._bytes[_STAMPED : len(self._bytes) - len(end)],
+                end,
+            )
+        )
 
 
 def transform_broadcaster(node: Node, parameter: str) -> Any:
@@ -212,8 +241,10 @@ def transform_broadcaster(node: Node, parameter: str) -> Any:
     try:
         return importlib.import_module('tf2_ros').TransformBroadcaster(node)
     except ImportError as error:
-        raise MissingInputError(f'{parameter} needs tf2_ros, which is not installed: install '
-                                f'ros-jazzy-tf2-ros-py, or set {parameter} to false') from error
+        raise MissingInputError(
+            f'{parameter} needs tf2_ros, which is not installed: install '
+            f'ros-jazzy-tf2-ros-py, or set {parameter} to false'
+        ) from error
 
 
 class TransformLookup:
@@ -250,8 +281,14 @@ class TransformLookup:
 
 def overridable() -> QoSOverridingOptions:
     """The policies that parameters may override."""
-    return QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
-                                 QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
+    return QoSOverridingOptions(
+        (
+            QoSPolicyKind.HISTORY,
+            QoSPolicyKind.DEPTH,
+            QoSPolicyKind.RELIABILITY,
+            QoSPolicyKind.DURABILITY,
+        )
+    )
 
 
 def best_effort(depth: int) -> QoSProfile:
@@ -259,8 +296,9 @@ def best_effort(depth: int) -> QoSProfile:
 
     A profile of its own for each topic: rclpy writes the topic's overrides into its argument.
     """
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth,
-                      reliability=ReliabilityPolicy.BEST_EFFORT)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT
+    )
 
 
 # -- Camera and IMU -------------------------------------------------------------------------------
@@ -271,8 +309,9 @@ _IMAGE_DEPTH = 15
 # Queue of some seconds of samples, so that none is lost while the process is stalled.
 _IMU_DEPTH = 2000
 # Messages published earlier are sent to reliable subscriptions only.
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 # Some seconds of stamps.
 _RECENT_STAMPS = 600
 # Period [s] at which IMU and CameraInfo are read without an image.
@@ -288,48 +327,79 @@ class SensorInputs:
     if /clock does not advance.
     """
 
-    def __init__(self, node: Node, intake: Intake | LiveCalibration, image_transport: str,
-                 on_invalid: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        intake: Intake | LiveCalibration,
+        image_transport: str,
+        on_invalid: Callable[[str], None],
+    ) -> None:
         self._intake, self._on_invalid = intake, on_invalid
-        self._info: Any = None   # the last CameraInfo
+        self._info: Any = None  # the last CameraInfo
         self._started_ns = time.monotonic_ns()
-        self.counts: Counter[str] = Counter()   # of messages by role, and of the `INVALID` ones
+        self.counts: Counter[str] = Counter()  # of messages by role, and of the `INVALID` ones
         self._last_ns: dict[Role, int] = {}
         self._last_info = b''
-        self.image_bytes = 0   # of the last image
-        self.frame_ids: dict[Role, str] = {}   # of the last messages
-        self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)   # of the last images
+        self.image_bytes = 0  # of the last image
+        self.frame_ids: dict[Role, str] = {}  # of the last messages
+        self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)  # of the last images
         self.topics = {role: node.resolve_topic_name(role.value) for role in TOPICS}
         # As image_transport does: the transport's name follows the remapped one.
         self.topics[Role.IMAGE] += '/compressed' if image_transport == 'compressed' else ''
         types = {role: message_class(PARTS[role].msgtypes[0]) for role in self.topics}
         types[Role.IMAGE] = message_class(
-            PARTS[Role.IMAGE].msgtypes[image_transport == 'compressed'])
+            PARTS[Role.IMAGE].msgtypes[image_transport == 'compressed']
+        )
         self._info_type = types[Role.CAMERA_INFO]
 
         def missing_info() -> bool:
             return self._intake.intrinsics is None
 
         self._camera_info = PolledSubscription(
-            node, self._info_type, Role.CAMERA_INFO.value, best_effort(_IMAGE_DEPTH),
-            partial(self._on_info, latched=False), missing_info, raw=True,
-            qos_overriding_options=overridable())
+            node,
+            self._info_type,
+            Role.CAMERA_INFO.value,
+            best_effort(_IMAGE_DEPTH),
+            partial(self._on_info, latched=False),
+            missing_info,
+            raw=True,
+            qos_overriding_options=overridable(),
+        )
         # A message that a driver published once, before this node started: only a subscription of
         # the same durability gets it, which most drivers do not match, and need not.
         self._latched = PolledSubscription(
-            node, self._info_type, Role.CAMERA_INFO.value, LATCHED,
-            partial(self._on_info, latched=True), missing_info, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-        self._imu = [PolledSubscription(
-            node, types[role], role.value, best_effort(_IMU_DEPTH),
-            partial(self._on_samples, role), lambda: self._intake.waits_for_imu(), raw=True,
-            qos_overriding_options=overridable())
-            for role in (Role.IMU, Role.ACCEL)]
+            node,
+            self._info_type,
+            Role.CAMERA_INFO.value,
+            LATCHED,
+            partial(self._on_info, latched=True),
+            missing_info,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
+        self._imu = [
+            PolledSubscription(
+                node,
+                types[role],
+                role.value,
+                best_effort(_IMU_DEPTH),
+                partial(self._on_samples, role),
+                lambda: self._intake.waits_for_imu(),
+                raw=True,
+                qos_overriding_options=overridable(),
+            )
+            for role in (Role.IMU, Role.ACCEL)
+        ]
         node.create_subscription(
-            types[Role.IMAGE], self.topics[Role.IMAGE], self._on_image,
-            best_effort(_IMAGE_DEPTH), qos_overriding_options=overridable())
-        self._timer = node.create_timer(_DRAIN_PERIOD, self._drain,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+            types[Role.IMAGE],
+            self.topics[Role.IMAGE],
+            self._on_image,
+            best_effort(_IMAGE_DEPTH),
+            qos_overriding_options=overridable(),
+        )
+        self._timer = node.create_timer(
+            _DRAIN_PERIOD, self._drain, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def hand_to(self, intake: Intake | LiveCalibration) -> None:
         """Messages go to another receiver from here on, the last CameraInfo first."""
@@ -352,7 +422,7 @@ class SensorInputs:
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
         self._drain()
-        self._timer.reset()   # no wake-up of its own while images come
+        self._timer.reset()  # no wake-up of its own while images come
 
     def _on_info(self, messages: list[bytes], *, latched: bool) -> None:
         """Receive each serialised CameraInfo that differs by more than its stamp: few do."""

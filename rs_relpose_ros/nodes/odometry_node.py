@@ -44,7 +44,8 @@ _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
     f'subscribes: {_PAIRS}, imu, accel, camera_info, calibration\n'
     'publishes:  ~/odometry, ~/keyframes, ~/path, /diagnostics, /tf with publish_odometry_tf\n'
-    'service:    ~/reset')
+    'service:    ~/reset'
+)
 
 
 class OdometryNode(StoppableNode):
@@ -56,13 +57,16 @@ class OdometryNode(StoppableNode):
         self.log_compiling()
         warm_up_odometry()
         self._begun = False
-        self._imu_lookup = (inputs.TransformLookup(self)
-                            if self._settings.current.calibration.use_tf else None)
+        self._imu_lookup = (
+            inputs.TransformLookup(self) if self._settings.current.calibration.use_tf else None
+        )
         self.use_calibrations()
         missing = self._settings.current.sensor.missing()
         if missing:
-            self._info(f'waiting for {" and ".join(missing)}: parameters, or the calibration of '
-                       f'relpose_node on {self.resolve_topic_name("calibration")}')
+            self._info(
+                f'waiting for {" and ".join(missing)}: parameters, or the calibration of '
+                f'relpose_node on {self.resolve_topic_name("calibration")}'
+            )
         else:
             self._begin(self._settings.current)
 
@@ -75,6 +79,7 @@ class OdometryNode(StoppableNode):
     def _use(self, parameters: Parameters) -> None:
         """A path with these parameters, from the next pair on."""
         from rs_relpose_ros.odometry.estimator import OdometryEstimator
+
         self._estimator = OdometryEstimator(parameters)
         self._continuous = ContinuousPath(self._estimator.propagated)
         if self._estimator.base is None:
@@ -85,10 +90,13 @@ class OdometryNode(StoppableNode):
         self._use(parameters)
         self._sample_at = time.monotonic()
         self._serialised = inputs.Serialised()
-        self._frames: dict[Role, str] = {}   # of the samples
+        self._frames: dict[Role, str] = {}  # of the samples
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
-        self._transforms = (inputs.transform_broadcaster(self, 'publish_odometry_tf')
-                            if self._config.publish_odometry_tf else None)
+        self._transforms = (
+            inputs.transform_broadcaster(self, 'publish_odometry_tf')
+            if self._config.publish_odometry_tf
+            else None
+        )
         with legal_qos():
             self._open_topics()
         self.create_service(Trigger, '~/reset', self._reset)
@@ -102,31 +110,66 @@ class OdometryNode(StoppableNode):
 
     def _open_topics(self) -> None:
         overridable = QoSOverridingOptions.with_default_policies
-        self._odometry, self._keyframes = (self.create_publisher(
-            message_class('nav_msgs/msg/Odometry'), topic, QoSProfile(depth=_DEPTH),
-            qos_overriding_options=overridable()) for topic in ('~/odometry', '~/keyframes'))
+        self._odometry, self._keyframes = (
+            self.create_publisher(
+                message_class('nav_msgs/msg/Odometry'),
+                topic,
+                QoSProfile(depth=_DEPTH),
+                qos_overriding_options=overridable(),
+            )
+            for topic in ('~/odometry', '~/keyframes')
+        )
         self._path_topic = self.create_publisher(message_class('nav_msgs/msg/Path'), '~/path', 1)
 
-        def polled(topic: str, msgtype: str, qos: QoSProfile, receive: Callable[[Any], None],
-                   *, raw: bool = True) -> inputs.PolledSubscription:
+        def polled(
+            topic: str,
+            msgtype: str,
+            qos: QoSProfile,
+            receive: Callable[[Any], None],
+            *,
+            raw: bool = True,
+        ) -> inputs.PolledSubscription:
             def receive_all(messages: list[Any]) -> None:
                 for message in messages:
                     receive(message)
+
             return inputs.PolledSubscription(
-                self, message_class(msgtype), topic, qos, receive_all, lambda: False, raw=raw,
-                qos_overriding_options=overridable())
+                self,
+                message_class(msgtype),
+                topic,
+                qos,
+                receive_all,
+                lambda: False,
+                raw=raw,
+                qos_overriding_options=overridable(),
+            )
 
         # Read as often as odometry is published: each message would wake the process.
         # Of CameraInfo whether the camera still delivers where no pair comes.
         self._inputs = [
-            *(polled(role.value, PARTS[role].msgtypes[0], inputs.best_effort(_IMU_DEPTH),
-                     partial(self._on_sample, role))
-              for role in (Role.IMU, Role.ACCEL)),
-            polled(Role.CAMERA_INFO.value, 'sensor_msgs/msg/CameraInfo',
-                   inputs.best_effort(_DEPTH),
-                   lambda info: self._estimator.add_frame(stamp_of_cdr(info))),
-            polled(_PAIRS, 'diagnostic_msgs/msg/DiagnosticArray',
-                   QoSProfile(depth=outgoing.PAIR_HISTORY), self._on_pair, raw=False)]
+            *(
+                polled(
+                    role.value,
+                    PARTS[role].msgtypes[0],
+                    inputs.best_effort(_IMU_DEPTH),
+                    partial(self._on_sample, role),
+                )
+                for role in (Role.IMU, Role.ACCEL)
+            ),
+            polled(
+                Role.CAMERA_INFO.value,
+                'sensor_msgs/msg/CameraInfo',
+                inputs.best_effort(_DEPTH),
+                lambda info: self._estimator.add_frame(stamp_of_cdr(info)),
+            ),
+            polled(
+                _PAIRS,
+                'diagnostic_msgs/msg/DiagnosticArray',
+                QoSProfile(depth=outgoing.PAIR_HISTORY),
+                self._on_pair,
+                raw=False,
+            ),
+        ]
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
@@ -158,8 +201,13 @@ class OdometryNode(StoppableNode):
 
     def _place_imu(self, camera: str, imu: str) -> None:
         """Position of the IMU by /tf_static, if it is there before the path begins."""
-        if (self._imu_lookup is None or not imu or imu == camera or self._estimator.starts
-                or (found := self._imu_lookup(camera, imu)) is None):
+        if (
+            self._imu_lookup is None
+            or not imu
+            or imu == camera
+            or self._estimator.starts
+            or (found := self._imu_lookup(camera, imu)) is None
+        ):
             return
         self._imu_lookup = None
         values, contradiction = extrinsics(self._settings.current, found, camera, imu)
@@ -172,9 +220,11 @@ class OdometryNode(StoppableNode):
         frame = frame_id_of_cdr(data)
         first = self._frames.setdefault(role, frame)
         if frame != first:
-            self._warn(f'a message of {frame} on {self.resolve_topic_name(role.value)} is not '
-                       f'used, as the first was of {first}: remap {role.value} to one IMU; '
-                       '~/reset accepts another one')
+            self._warn(
+                f'a message of {frame} on {self.resolve_topic_name(role.value)} is not '
+                f'used, as the first was of {first}: remap {role.value} to one IMU; '
+                '~/reset accepts another one'
+            )
             return
         if role is Role.IMU:
             self._silent[self._imu] = 0
@@ -197,9 +247,15 @@ class OdometryNode(StoppableNode):
             self._publish(self._estimator.newest_ns)
         for keyframe in self._estimator.take(most=1):
             self._keyframes.publish(self._message(keyframe))
-            self._path.append(outgoing.pose_stamped_message(
-                keyframe.stamp_ns, self._config.odometry_frame, keyframe.R, keyframe.position,
-                message_class))
+            self._path.append(
+                outgoing.pose_stamped_message(
+                    keyframe.stamp_ns,
+                    self._config.odometry_frame,
+                    keyframe.R,
+                    keyframe.position,
+                    message_class,
+                )
+            )
             if self._config.odometry_rate == 0.0:
                 self._publish(keyframe.imu_ns)
         for text in self._estimator.warnings():
@@ -208,16 +264,32 @@ class OdometryNode(StoppableNode):
 
     def _message(self, odometry: Odometry) -> bytes:
         """A serialised nav_msgs/Odometry, whose numbers are its end."""
+
         def empty() -> Any:
             return message_class('nav_msgs/msg/Odometry')(
                 header=outgoing.header(0, self._config.odometry_frame, message_class),
-                child_frame_id=odometry.frame_id)
-        of_pose, of_twist = map(outgoing.published_covariance, (
-            odometry.pose_covariance, odometry.velocity_covariance))
+                child_frame_id=odometry.frame_id,
+            )
+
+        of_pose, of_twist = map(
+            outgoing.published_covariance, (odometry.pose_covariance, odometry.velocity_covariance)
+        )
         # The twist is in the axes of the child frame.
-        return self._serialised(odometry.stamp_ns, odometry.frame_id, empty, np.concatenate([
-            odometry.position, outgoing.quat_xyzw(odometry.R), of_pose,
-            odometry.velocity, odometry.angular_velocity, of_twist]).tobytes())
+        return self._serialised(
+            odometry.stamp_ns,
+            odometry.frame_id,
+            empty,
+            np.concatenate(
+                [
+                    odometry.position,
+                    outgoing.quat_xyzw(odometry.R),
+                    of_pose,
+                    odometry.velocity,
+                    odometry.angular_velocity,
+                    of_twist,
+                ]
+            ).tobytes(),
+        )
 
     def _publish(self, imu_ns: int) -> None:
         """Publish the state at a time, if it is known and newer than the last one."""
@@ -226,14 +298,24 @@ class OdometryNode(StoppableNode):
             return
         self._odometry.publish(self._message(odometry))
         if self._transforms is not None:
-            self._transforms.sendTransform(outgoing.transform_message(
-                odometry.stamp_ns, self._config.odometry_frame, odometry.frame_id,
-                odometry.R, odometry.position, message_class))
+            self._transforms.sendTransform(
+                outgoing.transform_message(
+                    odometry.stamp_ns,
+                    self._config.odometry_frame,
+                    odometry.frame_id,
+                    odometry.R,
+                    odometry.position,
+                    message_class,
+                )
+            )
 
     def _report(self) -> None:
         if self._path and self._path_topic.get_subscription_count():
-            self._path_topic.publish(message_class('nav_msgs/msg/Path')(
-                header=self._path[-1].header, poses=list(self._path)))
+            self._path_topic.publish(
+                message_class('nav_msgs/msg/Path')(
+                    header=self._path[-1].header, poses=list(self._path)
+                )
+            )
         self.warn_of_namesake()
         estimator = self._estimator
         level, state = _LEVELS[estimator.state.value], estimator.state.value
@@ -244,22 +326,48 @@ class OdometryNode(StoppableNode):
             self._warn(state)
         for topic in self._silent:
             self._silent[topic] += 1
-        silent = [f'{topic} for {reports - 1} s' for topic, reports in self._silent.items()
-                  if reports > _SILENCE]
+        silent = [
+            f'{topic} for {reports - 1} s'
+            for topic, reports in self._silent.items()
+            if reports > _SILENCE
+        ]
         if silent:
-            level, state = 2, (f'no message on {" and ".join(silent)}: start or remap what '
-                               'publishes it (relpose_node, the driver of the IMU)')
+            level, state = (
+                2,
+                (
+                    f'no message on {" and ".join(silent)}: start or remap what '
+                    'publishes it (relpose_node, the driver of the IMU)'
+                ),
+            )
             self._warn(state)
-        values = [('state', estimator.state.value), ('reason', estimator.reason), *(
-            (name.replace(' ', '_'), str(estimator.counts[name])) for name in (
-                'pairs', 'contradicting', 'late', 'without images', 'dropped', 'lost',
-                'calibration contradicted')), *(
-            (name, ' '.join(f'{value:.3f}' for value in vector)) for name, vector in zip(
-                ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True))]
+        values = [
+            ('state', estimator.state.value),
+            ('reason', estimator.reason),
+            *(
+                (name.replace(' ', '_'), str(estimator.counts[name]))
+                for name in (
+                    'pairs',
+                    'contradicting',
+                    'late',
+                    'without images',
+                    'dropped',
+                    'lost',
+                    'calibration contradicted',
+                )
+            ),
+            *(
+                (name, ' '.join(f'{value:.3f}' for value in vector))
+                for name, vector in zip(
+                    ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True
+                )
+            ),
+        ]
         if estimator.starts:
             started = estimator.starts[-1]
-            values += [('started', 'at rest' if started.at_rest else 'in motion'),
-                       ('start_scale_sigma', f'{started.scale_sigma:.3f}')]
+            values += [
+                ('started', 'at rest' if started.at_rest else 'in motion'),
+                ('start_scale_sigma', f'{started.scale_sigma:.3f}'),
+            ]
         self.publish_status(level, 'odometry', state, self._pairs, values)
 
 

@@ -44,8 +44,11 @@ class NodeParameters:
     def adopt(self, values: Mapping[str, Any]) -> None:
         """Set the live ones among `values` that the user has not given; InputError if illegal."""
         live = {name for name, _, declared in Parameters.declarations() if declared.live}
-        new = [Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-               for name, value in values.items() if name in live - self._given]
+        new = [
+            Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+            for name, value in values.items()
+            if name in live - self._given
+        ]
         self._adopting = True
         try:
             result = self._node.set_parameters_atomically(new)
@@ -100,17 +103,19 @@ def legal_qos() -> Iterator[None]:
 
 def unknown_qos_overrides(node: Node) -> list[str]:
     """A warning for each QoS override without a subscription; call it when all are made."""
-    return [f'{name} is no QoS override of this node: it must be {_QOS}<full topic name>'
-            '.subscription.<policy>, of a topic that it subscribes to'
-            for name in getattr(node, '_parameter_overrides', {})
-            if name.startswith(_QOS) and not node.has_parameter(name)]
+    return [
+        f'{name} is no QoS override of this node: it must be {_QOS}<full topic name>'
+        '.subscription.<policy>, of a topic that it subscribes to'
+        for name in getattr(node, '_parameter_overrides', {})
+        if name.startswith(_QOS) and not node.has_parameter(name)
+    ]
 
 
 def _declare(node: Node, name: str, default: Any, declared: Declared) -> Any:
     try:
         parameter = node.declare_parameter(
-            name, list(default) if isinstance(default, tuple) else default,
-            _descriptor(declared))
+            name, list(default) if isinstance(default, tuple) else default, _descriptor(declared)
+        )
     except ParameterException as error:
         raise InputError(f'parameter {name} must be {declared.legal}: {error}') from error
     return _plain(parameter.value)
@@ -119,14 +124,17 @@ def _declare(node: Node, name: str, default: Any, declared: Declared) -> Any:
 def _descriptor(declared: Declared) -> msg.ParameterDescriptor:
     unit = f' [{declared.unit}]' if declared.unit else ''
     descriptor = msg.ParameterDescriptor(
-        description=declared.description + unit, additional_constraints=declared.legal,
+        description=declared.description + unit,
+        additional_constraints=declared.legal,
         read_only=not declared.live,
         # YAML reads "0" and "[0, 0, 0, 1]" as integers; `Parameters` checks the types.
-        dynamic_typing=True)
+        dynamic_typing=True,
+    )
     bounds = (max(declared.low, -sys.float_info.max), min(declared.high, sys.float_info.max))
     if declared.kind is float:
         descriptor.floating_point_range = [
-            msg.FloatingPointRange(from_value=bounds[0], to_value=bounds[1], step=0.0)]
+            msg.FloatingPointRange(from_value=bounds[0], to_value=bounds[1], step=0.0)
+        ]
     elif declared.kind is int:
         limit = 2**63 - 1
         low, high = (int(min(max(bound, -limit), limit)) for bound in bounds)
@@ -136,6 +144,6 @@ def _descriptor(declared: Declared) -> msg.ParameterDescriptor:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, str) and value.startswith('['):
-        with suppress(yaml.YAMLError):   # a list of floats and integers, by `ros2 param set`
+        with suppress(yaml.YAMLError):  # a list of floats and integers, by `ros2 param set`
             value = yaml.safe_load(value)
     return tuple(value) if isinstance(value, list | array.array) else value

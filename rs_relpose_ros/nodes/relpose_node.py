@@ -25,7 +25,8 @@ _DESCRIPTION = (
     'camera_info, imu, accel\n'
     'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, '
     '~/relative_rotation, ~/pairs,\n            ~/debug_image, ~/calibration, /diagnostics\n'
-    'services:   ~/reset, ~/calibrate, ~/save_calibration')
+    'services:   ~/reset, ~/calibrate, ~/save_calibration'
+)
 
 
 class RelposeNode(SensorNode):
@@ -68,8 +69,11 @@ class RelposeNode(SensorNode):
     def _on_processed(self, frame: Frame[PairResult]) -> None:
         if frame.result is not None:
             config = self._settings.current.pair
-            self._outputs.publish(frame.result, config, partial(
-                self._statistics.add_pair, frame.result, frame.ready_ns))
+            self._outputs.publish(
+                frame.result,
+                config,
+                partial(self._statistics.add_pair, frame.result, frame.ready_ns),
+            )
             self._log_health(frame.result.health, withhold=config.withhold_when_wrong)
         if self._timings is not None:
             self._timings.add(frame)
@@ -77,20 +81,26 @@ class RelposeNode(SensorNode):
 
 # -- Topics ---------------------------------------------------------------------------------------
 
+
 class PairPublishers:
     """Publishes pairs on the topics of the node, and as a transform with publish_tf."""
 
     def __init__(self, node: Node, config: PairConfig) -> None:
         self._pair = {
             name: node.create_publisher(message_class(msgtype), f'~/{name}', outgoing.PAIR_HISTORY)
-            for name, msgtype in PAIR_TOPICS.items()}
+            for name, msgtype in PAIR_TOPICS.items()
+        }
         self._debug_image = node.create_publisher(
-            message_class('sensor_msgs/msg/Image'), f'~/{DEBUG_IMAGE}', 2)
-        self._transforms = (transform_broadcaster(node, 'publish_tf') if config.publish_tf
-                            else None)
+            message_class('sensor_msgs/msg/Image'), f'~/{DEBUG_IMAGE}', 2
+        )
+        self._transforms = transform_broadcaster(node, 'publish_tf') if config.publish_tf else None
 
-    def publish(self, result: PairResult, config: PairConfig, published: Callable[[], object],
-                ) -> None:
+    def publish(
+        self,
+        result: PairResult,
+        config: PairConfig,
+        published: Callable[[], object],
+    ) -> None:
         """Publish what is known of a pair and subscribed; `published` follows the first topic."""
         parts = outgoing.pair_parts(result, message_class, config.reference_frame)
         first = next(iter(parts))
@@ -104,15 +114,25 @@ class PairPublishers:
             # the reference is the child, by the pose's inverse. Its origin is one baseline away,
             # whose length in metres is unknown.
             quaternion = outgoing.quat_xyzw(result.pose.R)
-            self._transforms.sendTransform(outgoing.transform_message(
-                result.stamp_ns, result.frame_id,
-                config.reference_frame or f'{result.frame_id}_reference',
-                quaternion * [-1.0, -1.0, -1.0, 1.0],
-                -Rotation.from_quat(quaternion).inv().apply(result.pose.t), message_class))
+            self._transforms.sendTransform(
+                outgoing.transform_message(
+                    result.stamp_ns,
+                    result.frame_id,
+                    config.reference_frame or f'{result.frame_id}_reference',
+                    quaternion * [-1.0, -1.0, -1.0, 1.0],
+                    -Rotation.from_quat(quaternion).inv().apply(result.pose.t),
+                    message_class,
+                )
+            )
         if config.publish_debug_image and self._debug_image.get_subscription_count():
-            self._debug_image.publish(outgoing.image_message(
-                result.stamp_ns, result.frame_id, Pixels(outgoing.draw_pair(result), 'bgr8'),
-                message_class))
+            self._debug_image.publish(
+                outgoing.image_message(
+                    result.stamp_ns,
+                    result.frame_id,
+                    Pixels(outgoing.draw_pair(result), 'bgr8'),
+                    message_class,
+                )
+            )
 
 
 main = partial(run_node, RelposeNode, NAME, _DESCRIPTION)

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 
 # -- A node as a process --------------------------------------------------------------------------
 
+
 class StoppableNode(Node):
     """A node of `run_node` with log lines and parameters; it may have threads of its own.
 
@@ -79,9 +80,11 @@ class StoppableNode(Node):
 
     def use_calibrations(self) -> None:
         """Use the calibrations that relpose_node publishes."""
+
         def use(message: String) -> None:
             self._info('using the calibration of relpose_node')
             self.adopt(message.data, 'calibration')
+
         self.create_subscription(String, 'calibration', use, LATCHED)
 
     def adopt(self, parameters: str, source: str) -> None:
@@ -91,35 +94,51 @@ class StoppableNode(Node):
         except InputError as error:
             self._error(str(error))
 
-    def publish_status(self, level: int, task: str, text: str, hardware_id: str,
-                       values: Sequence[tuple[str, str]]) -> None:
+    def publish_status(
+        self, level: int, task: str, text: str, hardware_id: str, values: Sequence[tuple[str, str]]
+    ) -> None:
         """Publish a status on /diagnostics."""
-        self._diagnostics.publish(outgoing.diagnostics_message(
-            self.get_clock().now().nanoseconds, level,
-            f'{self.get_fully_qualified_name()}: {task}', text, hardware_id, values,
-            message_class))
+        self._diagnostics.publish(
+            outgoing.diagnostics_message(
+                self.get_clock().now().nanoseconds,
+                level,
+                f'{self.get_fully_qualified_name()}: {task}',
+                text,
+                hardware_id,
+                values,
+                message_class,
+            )
+        )
 
     def log_compiling(self) -> None:
         """Log that this start takes long, where it does."""
         if not cache_is_filled():
-            self._info('compiling kernels, as the build has none for this machine: this start '
-                       'takes a minute or two, later ones some seconds')
+            self._info(
+                'compiling kernels, as the build has none for this machine: this start '
+                'takes a minute or two, later ones some seconds'
+            )
 
     def warn_of_namesake(self) -> None:
         """Warn of another node of this name: services and parameters reach either of them."""
         own = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own) > 1:
-            self._warn(f'another node has the name {self.get_fully_qualified_name()}: services '
-                       'and parameters reach either of them; start one with -r __node:=NAME')
+            self._warn(
+                f'another node has the name {self.get_fully_qualified_name()}: services '
+                'and parameters reach either of them; start one with -r __node:=NAME'
+            )
 
     def stop(self) -> bool:
         """End its threads; whether they ended. Called before `destroy_node`."""
         return True
 
 
-def run_node(make: Callable[[], StoppableNode], name: str, description: str,
-             arguments: Sequence[str] | None = None,
-             on_started: Callable[[Callable[[], object]], object] = lambda stop: None) -> int:
+def run_node(
+    make: Callable[[], StoppableNode],
+    name: str,
+    description: str,
+    arguments: Sequence[str] | None = None,
+    on_started: Callable[[Callable[[], object]], object] = lambda stop: None,
+) -> int:
     """Run a node until it is stopped; its exit code: 0, or 2 for an illegal parameter.
 
     `description` is that of its ``--help``; `on_started` gets the function that stops the node,
@@ -134,7 +153,7 @@ def run_node(make: Callable[[], StoppableNode], name: str, description: str,
         logger.fatal(str(error).split(', at /')[0].strip())
         return 2
     _help(name, description).parse_args(own[1:])
-    if not (os.environ.get('HOME') or os.environ.get('ROS_HOME')):   # rcl has no folder to log in
+    if not (os.environ.get('HOME') or os.environ.get('ROS_HOME')):  # rcl has no folder to log in
         os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
     rclpy.init(args=list(given), signal_handler_options=SignalHandlerOptions.NO)
     executor, stopped = KeptWaitSet(), threading.Event()
@@ -146,7 +165,7 @@ def run_node(make: Callable[[], StoppableNode], name: str, description: str,
         while not stopped.is_set():
             executor.spin_once()
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass   # of a caller that has not blocked the signals, or has ended the context
+        pass  # of a caller that has not blocked the signals, or has ended the context
     except RsRelposeError as error:
         logger.fatal(str(error))
         return 2
@@ -165,11 +184,16 @@ def _help(name: str, description: str) -> argparse.ArgumentParser:
     lines = ['parameters (set them with --ros-args -p NAME:=VALUE or --params-file FILE):']
     for parameter, default, declared in Parameters.declarations():
         shown = 'no default' if default is None else f'default {default!r}'
-        lines.append(f'  {parameter}: {declared.description}. {declared.legal}; {shown}'
-                     f'{"; live" if declared.live else ""}')
+        lines.append(
+            f'  {parameter}: {declared.description}. {declared.legal}; {shown}'
+            f'{"; live" if declared.live else ""}'
+        )
     return argparse.ArgumentParser(
-        prog=name, formatter_class=argparse.RawDescriptionHelpFormatter, description=description,
-        epilog='\n'.join(lines))
+        prog=name,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=description,
+        epilog='\n'.join(lines),
+    )
 
 
 def leave(code: int) -> NoReturn:
@@ -197,11 +221,15 @@ class Worker(threading.Thread):
     `warm` is not set; then the thread ends.
     """
 
-    def __init__(self, loop: FrameLoop[Any] | LiveCalibration, warm_up: Callable[[], object],
-                 consume: Callable[[Any], object]) -> None:
+    def __init__(
+        self,
+        loop: FrameLoop[Any] | LiveCalibration,
+        warm_up: Callable[[], object],
+        consume: Callable[[Any], object],
+    ) -> None:
         # A daemon: a thread that compiles cannot be stopped, and must not delay the exit.
         super().__init__(name='frame_worker', daemon=True)
-        self.warm = threading.Event()   # the kernels are compiled or loaded
+        self.warm = threading.Event()  # the kernels are compiled or loaded
         self._loop = loop
         self._warm_up = warm_up
         self._consume = consume
@@ -257,7 +285,7 @@ class SensorNode(StoppableNode):
     def __init__(self, name: str, statistics: diagnostics.FrameStatistics) -> None:
         super().__init__(name)
         self._frame_statistics = statistics
-        self._stamps: LineFile | None = None   # of the frames that were processed or failed
+        self._stamps: LineFile | None = None  # of the frames that were processed or failed
         self._loop: FrameLoop[Any] | None = None
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
@@ -268,11 +296,10 @@ class SensorNode(StoppableNode):
             self._open_outputs(self._settings.current)
         self.create_service(Trigger, '~/reset', self._reset)
         # None once its transform is used; the rotation IMU to camera in it.
-        self._lookup = (TransformLookup(self) if self._settings.current.calibration.use_tf
-                        else None)
+        self._lookup = TransformLookup(self) if self._settings.current.calibration.use_tf else None
         self._quat_prior: tuple[float, ...] | None = None
-        self._found: Calibrated | None = None   # to be used by the executor's thread
-        self._calibrated: Calibrated | None = None   # in use
+        self._found: Calibrated | None = None  # to be used by the executor's thread
+        self._calibrated: Calibrated | None = None  # in use
         if self.calibrates:
             self._published = self.create_publisher(String, '~/calibration', LATCHED)
             self.create_service(Trigger, '~/calibrate', self._calibrate_now)
@@ -306,20 +333,30 @@ class SensorNode(StoppableNode):
         """The fault of parameters or topics; empty for none."""
         parameters, idle = self._settings.current, self._frame_statistics.idle
         missing = parameters.sensor.missing()
-        if (missing and parameters.calibration.calibrate_at_start == 'never'
-                and not self._waits_for_tf()):
-            return (f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
-                    'calibrate_at_start: missing')
+        if (
+            missing
+            and parameters.calibration.calibrate_at_start == 'never'
+            and not self._waits_for_tf()
+        ):
+            return (
+                f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
+                'calibrate_at_start: missing'
+            )
         topic = self.resolve_topic_name('image')
         if 'image_rect' in topic:
-            return (f'{idle}: {topic} is a rectified image, whose rows have no single '
-                    'timestamp; remap image to the raw one')
+            return (
+                f'{idle}: {topic} is a rectified image, whose rows have no single '
+                'timestamp; remap image to the raw one'
+            )
         return ''
 
     def _waits_for_tf(self) -> bool:
         """Whether only the rotation is missing, and /tf_static may give it."""
-        return (self._lookup is not None and not self._calibrating
-                and self._settings.current.sensor.missing() == ['quat_cam_imu_xyzw'])
+        return (
+            self._lookup is not None
+            and not self._calibrating
+            and self._settings.current.sensor.missing() == ['quat_cam_imu_xyzw']
+        )
 
     def _begin(self, calibrate: bool = False) -> None:
         """Estimate with the current parameters from here on, or calibrate before."""
@@ -339,17 +376,24 @@ class SensorNode(StoppableNode):
         if calibrate or parameters.sensor.missing():
             # Imported where it is needed: a start with a calibration is faster by it.
             from rs_relpose_ros.calibrate.live import LiveCalibration
-            config, others = parameters.calibration, [
-                'the rotation of the IMU on /tf_static'] if self._waits_for_tf() else []
+
+            config, others = (
+                parameters.calibration,
+                ['the rotation of the IMU on /tf_static'] if self._waits_for_tf() else [],
+            )
             if not self.calibrates:
-                others.append('a calibration by relpose_node on '
-                              + self.resolve_topic_name('calibration'))
+                others.append(
+                    'a calibration by relpose_node on ' + self.resolve_topic_name('calibration')
+                )
             fits = self.calibrates and config.calibrate_at_start != 'never'
             self._calibration = LiveCalibration(
-                parameters, use_stored=not calibrate and config.load_calibration
+                parameters,
+                use_stored=not calibrate
+                and config.load_calibration
                 and config.calibrate_at_start != 'never',
                 waits_for='' if fits else ' or '.join(others),
-                topic=self.resolve_topic_name('image'))
+                topic=self.resolve_topic_name('image'),
+            )
             self._calibration.quat_prior = self._quat_prior
             self._intake: Any = self._calibration
             self._progress = Progress('calibrating: waiting for images and gyro')
@@ -375,8 +419,9 @@ class SensorNode(StoppableNode):
             self._log_ready(self._inputs)
             return
         with ros_parameters.legal_qos():
-            inputs = SensorInputs(self, self._intake,
-                                  self._settings.current.pair.image_transport, self._error)
+            inputs = SensorInputs(
+                self, self._intake, self._settings.current.pair.image_transport, self._error
+            )
         for warning in ros_parameters.unknown_qos_overrides(self):
             self._warn(warning)
         # Objects that exist by now are permanent: the garbage collector need not scan them.
@@ -413,7 +458,8 @@ class SensorNode(StoppableNode):
     # -- calibration -------------------------------------------------------------------------
 
     def _consume_calibration(
-            self, outcome: Progress | Calibrated | RsRelposeError | FrameFailed) -> None:
+        self, outcome: Progress | Calibrated | RsRelposeError | FrameFailed
+    ) -> None:
         """By the worker; a calibration is used by `_use_found`, in the executor's thread."""
         if isinstance(outcome, FrameFailed):
             self._consume(outcome)
@@ -445,7 +491,7 @@ class SensorNode(StoppableNode):
         if self.calibrates:
             self._published.publish(String(data=found.parameters))
         self.adopt(found.parameters, str(path))
-        if self._calibration is not None:   # nothing in it was new, or it cannot be used
+        if self._calibration is not None:  # nothing in it was new, or it cannot be used
             missing = self._settings.current.sensor.missing()
             if missing:
                 self._warn(f'the calibration in {path} has no usable {" and ".join(missing)}')
@@ -461,7 +507,8 @@ class SensorNode(StoppableNode):
         if found is None:
             if self._calibration is not None and self._calibration.waits_for:
                 self._progress = Progress(
-                    f'waiting for {self._calibration.waits_for}: {self._lookup.problem}')
+                    f'waiting for {self._calibration.waits_for}: {self._lookup.problem}'
+                )
                 self._info(self._progress.text)
             return
         self._quat_prior = found[3:]
@@ -480,8 +527,10 @@ class SensorNode(StoppableNode):
     def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Calibrate from here on; values that the user has given stay."""
         self._begin(calibrate=True)
-        response.success, response.message = not self._cannot_start, (
-            self._cannot_start or 'calibrating: rotate the camera about all three axes')
+        response.success, response.message = (
+            not self._cannot_start,
+            (self._cannot_start or 'calibrating: rotate the camera about all three axes'),
+        )
         return response
 
     def _save_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -510,13 +559,16 @@ class SensorNode(StoppableNode):
             try:
                 self._on_processed(outcome)
             except SHUT_DOWN:
-                if self.context.ok():   # otherwise the node is being shut down
+                if self.context.ok():  # otherwise the node is being shut down
                     raise
             self._frame_statistics.add_frame(outcome.taken_ns)
             return
         assert self._worker is not None
-        warning = ('a frame failed and tracking restarts with the next one'
-                   if self._worker.warm.is_set() else 'the kernels cannot be compiled')
+        warning = (
+            'a frame failed and tracking restarts with the next one'
+            if self._worker.warm.is_set()
+            else 'the kernels cannot be compiled'
+        )
         self._frame_statistics.add_failure(f'{warning}: {outcome.reason}')
         error = outcome.error
         if isinstance(error, RsRelposeError):
@@ -527,17 +579,20 @@ class SensorNode(StoppableNode):
 
     def _log_refused(self, refused: FrameRefused) -> None:
         if refused.refusal is Refusal.NO_CALIBRATION:
-            return   # logged by `_missing_input`
+            return  # logged by `_missing_input`
         if refused.refusal is Refusal.IMU_GAP and not (
-                self._loop and self._loop.sequencer.counts().frames_taken):
-            return   # the images began before the IMU; if it lasts, `_log_silence` gives it
+            self._loop and self._loop.sequencer.counts().frames_taken
+        ):
+            return  # the images began before the IMU; if it lasts, `_log_silence` gives it
         if refused.refusal is Refusal.NO_IMU:
             # A gap of 0.3 s between IMU messages: the sensor has stopped.
             if self._inputs is not None and self._inputs.silent(Role.IMU, 0.3):
-                return   # logged by `_missing_input` after `SILENCE`
-            self._warn(f'a frame was not used: {refused.reason}; is '
-                       f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
-                       'stamps on the clock of the images (time_offset)?')
+                return  # logged by `_missing_input` after `SILENCE`
+            self._warn(
+                f'a frame was not used: {refused.reason}; is '
+                f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
+                'stamps on the clock of the images (time_offset)?'
+            )
         else:
             self._warn(f'a frame was not used ({refused.refusal.value}): {refused.reason}')
 
@@ -548,27 +603,39 @@ class SensorNode(StoppableNode):
             self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
         self.warn_of_namesake()
-        warning = '' if self._inputs is None else diagnostics.stamps_warning(
-            self._inputs.stamps_ns, self._inputs.image_bytes)
+        warning = (
+            ''
+            if self._inputs is None
+            else diagnostics.stamps_warning(self._inputs.stamps_ns, self._inputs.image_bytes)
+        )
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         source = self._calibration if self._loop is None else self._loop.sequencer
         report = self._frame_statistics.report(
-            counts, None if source is None else source.counts(),
-            problem=problem, missing=missing, progress=self._progress, warning=warning)
-        self.publish_status(report.level, self.task, report.text, self._image_topic(),
-                            report.values)
+            counts,
+            None if source is None else source.counts(),
+            problem=problem,
+            missing=missing,
+            progress=self._progress,
+            warning=warning,
+        )
+        self.publish_status(
+            report.level, self.task, report.text, self._image_topic(), report.values
+        )
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
             for role, frame_id in self._inputs.frame_ids.items():
                 if not frame_id:
-                    self._warn(f'messages on {self._inputs.topics[role]} have no frame_id: no '
-                               'transform is found for them, and RViz shows no result; set it in '
-                               'the driver')
+                    self._warn(
+                        f'messages on {self._inputs.topics[role]} have no frame_id: no '
+                        'transform is found for them, and RViz shows no result; set it in '
+                        'the driver'
+                    )
             if warning:
                 self._warn(warning)
 
-    def _log_silence(self, inputs: SensorInputs, silence: diagnostics.Silence,
-                     problem: str) -> None:
+    def _log_silence(
+        self, inputs: SensorInputs, silence: diagnostics.Silence, problem: str
+    ) -> None:
         """Log the reason for no result, once while it stays the same."""
         if inputs.silent(Role.IMAGE, PATIENCE):
             kind, text = diagnostics.why_no_image(self._image_topic(), self._topics_with_images())
@@ -576,7 +643,7 @@ class SensorNode(StoppableNode):
             self._reported_silence = ''
             return
         elif problem:
-            return   # which is logged anyway
+            return  # which is logged anyway
         else:
             kind, text = diagnostics.why_nothing(silence)
         if kind != self._reported_silence:
@@ -587,14 +654,22 @@ class SensorNode(StoppableNode):
         """Topics of other nodes, without pictures of pairs."""
         own = f'{self.get_fully_qualified_name()}/'
         images = set(PARTS[Role.IMAGE].msgtypes)
-        return [name for name, types in self.get_topic_names_and_types()
-                if images.intersection(types) and not name.startswith(own)
-                and not name.endswith(f'/{outgoing.DEBUG_IMAGE}') and self.count_publishers(name)]
+        return [
+            name
+            for name, types in self.get_topic_names_and_types()
+            if images.intersection(types)
+            and not name.startswith(own)
+            and not name.endswith(f'/{outgoing.DEBUG_IMAGE}')
+            and self.count_publishers(name)
+        ]
 
     def _image_topic(self) -> str:
         """The subscribed one, with its transport."""
-        return (self.resolve_topic_name('image') if self._inputs is None
-                else self._inputs.topics[Role.IMAGE])
+        return (
+            self.resolve_topic_name('image')
+            if self._inputs is None
+            else self._inputs.topics[Role.IMAGE]
+        )
 
     def _problem(self) -> tuple[str, tuple[str, ...]]:
         """The current reason for no result, and the names of missing parameters or inputs."""
@@ -613,8 +688,11 @@ class SensorNode(StoppableNode):
         """The missing input; logged, unless the driver is probably not running yet."""
         idle = self._frame_statistics.idle
         image, camera_info, imu, _ = inputs.topics.values()
-        missing = tuple(topic for role, topic in inputs.topics.items()
-                        if role is not Role.ACCEL and inputs.silent(role))
+        missing = tuple(
+            topic
+            for role, topic in inputs.topics.items()
+            if role is not Role.ACCEL and inputs.silent(role)
+        )
         if self._intake.camera_info_problem:
             return f'{idle}: {self._intake.camera_info_problem}', ('calibration',)
         # Without any image the driver is probably not running: a status, but no log line.
@@ -622,12 +700,16 @@ class SensorNode(StoppableNode):
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
         configured = self._settings.current.intrinsics.given
         if self._intake.intrinsics is None and camera_info in missing and not configured:
-            text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
-                    'topic of the driver, which must publish a calibration, or give '
-                    'camera_matrix')
+            text = (
+                f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
+                'topic of the driver, which must publish a calibration, or give '
+                'camera_matrix'
+            )
         elif imu in missing:
-            text = (f'{idle}: no IMU message on {imu} for {SILENCE:g} s; remap imu to '
-                    'the topic of the driver')
+            text = (
+                f'{idle}: no IMU message on {imu} for {SILENCE:g} s; remap imu to '
+                'the topic of the driver'
+            )
         else:
             return '', ()
         self._error(text)

@@ -18,7 +18,7 @@ from rs_relpose_ros.blas_threads import use_one_blas_thread
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-_stop: Callable[[], object] | None = None   # ends the spinning of the node
+_stop: Callable[[], object] | None = None  # ends the spinning of the node
 
 
 def start(node: str) -> NoReturn:
@@ -28,6 +28,7 @@ def start(node: str) -> NoReturn:
     threading.Thread(target=_wait_for_signal, name='signals', daemon=True).start()
     use_one_blas_thread()
     from rs_relpose_ros.nodes.sensor_node import leave
+
     run = importlib.import_module(f'rs_relpose_ros.nodes.{node}').main
     leave(run(on_started=_on_started))
 

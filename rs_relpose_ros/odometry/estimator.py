@@ -76,8 +76,10 @@ _CONTRADICTING, _WRONG_START, _GROSS = 4.0, 3.0, 5.0
 # Number of wrong starts in motion, or of contradicting pairs after a start, after which rest is no
 # start; of pairs that agree after it, in motion, after which axes of the IMU are not in doubt.
 _WRONG_STARTS, _PROVEN = 3, 20
-_CONTRADICTION = ('pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
-                  'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?')
+_CONTRADICTION = (
+    'pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
+    'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?'
+)
 # Longest propagation of a lost path by the IMU, and delay of pairs or samples behind others [s].
 _LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
 # Longest start [s]; then a new one begins.
@@ -109,10 +111,10 @@ class _Run:
     """A graph since its start."""
 
     graph: KeyframeGraph
-    path_end: _PathEnd   # of the path before
+    path_end: _PathEnd  # of the path before
     at_rest: bool
     first_ns: int
-    observed_ns: int   # of the newest pair that was used
+    observed_ns: int  # of the newest pair that was used
     # Times of the newest keyframe, or with `keep` of all: camera clock, IMU clock.
     stamps: deque[tuple[int, int]]
     frame_id: str
@@ -120,12 +122,12 @@ class _Run:
     variances: tuple[float, float] = (0.0, 0.0)
     # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
     recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
-    pairs: int = 0   # used
-    largest: float = 0.0   # innovation before the start
-    contradicting: int = 0   # not used
-    confirmed: int = 0   # since the start, by so many pairs in motion
+    pairs: int = 0  # used
+    largest: float = 0.0  # innovation before the start
+    contradicting: int = 0  # not used
+    confirmed: int = 0  # since the start, by so many pairs in motion
     published: bool = False
-    path: int = 0   # number of earlier starts
+    path: int = 0  # number of earlier starts
 
     @property
     def newest_ns(self) -> int:
@@ -145,40 +147,47 @@ class OdometryEstimator:
         self._R_cam_body = parameters.sensor.R_cam_imu
         # Position of the camera on the body with its covariance, as known at the next start.
         self._arm = -self._R_cam_body.T @ lever
-        self._arm_covariance = max(sigma, _LEAST_ARM_SIGMA if lever.any() else _UNKNOWN_ARM
-                                   )**2 * np.eye(3)
-        self._first_R: Array | None = None   # of the body at the first start: the origin
+        self._arm_covariance = max(
+            sigma, _LEAST_ARM_SIGMA if lever.any() else _UNKNOWN_ARM
+        ) ** 2 * np.eye(3)
+        self._first_R: Array | None = None  # of the body at the first start: the origin
         # None until it is known.
-        self.base = (Base() if not self._config.base_frame
-                     else None if self._config.base_to_camera is None
-                     else Base.of(self._config.base_frame, self._config.base_to_camera))
+        self.base = (
+            Base()
+            if not self._config.base_frame
+            else None
+            if self._config.base_to_camera is None
+            else Base.of(self._config.base_frame, self._config.base_to_camera)
+        )
         self._samples = ImuSamples(parameters.imu.max_imu_gap)
         self._gyro = StuckGyro(parameters.imu.stuck_gyro_time)
         self._keep = keep
-        self._camera = ''   # frame_id of the pairs
+        self._camera = ''  # frame_id of the pairs
         self._waiting: dict[int, KeyframePair] = {}
         self._run: _Run | None = None
-        self._last_run: _Run | None = None   # its end is the start of the next path
+        self._last_run: _Run | None = None  # its end is the start of the next path
         self._runs: list[_Run] = []
         self._last_ns: int | None = None
-        self._wrong_starts = 0   # since the last right one in motion
-        self._behind = 0   # consecutive samples that came too late
-        self._row_ns = 0   # from the stamped to the middle row
-        self._offset_ns = self._watched_ns = 0   # of the camera's clock from that of the IMU
+        self._wrong_starts = 0  # since the last right one in motion
+        self._behind = 0  # consecutive samples that came too late
+        self._row_ns = 0  # from the stamped to the middle row
+        self._offset_ns = self._watched_ns = 0  # of the camera's clock from that of the IMU
         # Of the newest frame: its stamp, arrival in IMU time and interval; of the newest pair that
         # could not be used: its time.
         self._frame_ns = self._arrived_ns = self._frame_interval_ns = self._unusable_ns = 0
         self._longest_interval = parameters.keyframes.max_keyframe_interval
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
-        self.intervals: list[StateInterval] = []   # with `keep`
-        self._corrections = 0   # number of changes to the newest keyframe
+        self.intervals: list[StateInterval] = []  # with `keep`
+        self._corrections = 0  # number of changes to the newest keyframe
         self.starts: list[StartReport] = []
         # Numbers of pairs and runs by outcome.
         self.counts: Counter[str] = Counter()
         self._warnings: list[str] = []
         if not lever.any():
-            self._warnings.append(f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m '
-                                  'of uncertainty; a measured one is better')
+            self._warnings.append(
+                f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m '
+                'of uncertainty; a measured one is better'
+            )
 
     @property
     def waiting(self) -> bool:
@@ -194,32 +203,38 @@ class OdometryEstimator:
     def blocking_reason(self) -> str:
         """Unknown base, or fault or contradiction that prevents a start; empty for none."""
         if self.base is None:
-            return (f'the camera is not known in base_frame {self._config.base_frame}: publish '
-                    'their static transform on /tf_static (tf2_ros reads it), or set '
-                    'base_to_camera')
+            return (
+                f'the camera is not known in base_frame {self._config.base_frame}: publish '
+                'their static transform on /tf_static (tf2_ros reads it), or set '
+                'base_to_camera'
+            )
         if self.state is not OdometryState.STARTING:
             return ''
         return self._samples.fault or (
-            _CONTRADICTION if self._wrong_starts >= _WRONG_STARTS else '')
+            _CONTRADICTION if self._wrong_starts >= _WRONG_STARTS else ''
+        )
 
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
         newest = self._samples.both_until_ns
-        self._behind = (self._behind + 1 if newest is not None
-                        and sample.stamp_ns < newest - _LATE_NS else 0)
+        self._behind = (
+            self._behind + 1 if newest is not None and sample.stamp_ns < newest - _LATE_NS else 0
+        )
         if newest is not None and self._behind == _SET_BACK:
             self._end('the clock of the IMU was set back', newest)
             self._behind = self._watched_ns = 0
             self._samples.clear()
             self._waiting, self._last_ns = {}, None
         elif self._behind:
-            return   # too late for any pair
+            return  # too late for any pair
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
         if sample.stamp_ns >= self._watched_ns + _WATCH_NS:
             self._watched_ns = sample.stamp_ns
-            self._samples.prune(sample.stamp_ns - to_nanoseconds(
-                max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY))
+            self._samples.prune(
+                sample.stamp_ns
+                - to_nanoseconds(max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY)
+            )
             try:
                 self._watch(sample.stamp_ns)
             except GraphError as error:
@@ -229,8 +244,9 @@ class OdometryEstimator:
         """Tell that no sample has come for some time; the next ones decide whether it is a gap."""
         run = self._run
         if run is not None and run.published:
-            self._change(OdometryState.LOST, f'no message of the IMU for {seconds:.2f} s',
-                         self._watched_ns)
+            self._change(
+                OdometryState.LOST, f'no message of the IMU for {seconds:.2f} s', self._watched_ns
+            )
 
     def add_frame(self, stamp_ns: int) -> None:
         """Tell that a frame has arrived: pairs are due then, or missing if none arrives."""
@@ -244,18 +260,22 @@ class OdometryEstimator:
         """
         self._camera = self._camera or pair.frame_id
         if pair.frame_id != self._camera:
-            raise InputError(f'a pair of {pair.frame_id} is not used, as the first was of '
-                             f'{self._camera}: remap relpose_node/pairs to those of one camera; '
-                             '~/reset accepts another one')
+            raise InputError(
+                f'a pair of {pair.frame_id} is not used, as the first was of '
+                f'{self._camera}: remap relpose_node/pairs to those of one camera; '
+                '~/reset accepts another one'
+            )
         self.counts['pairs'] += 1
         newest_ns = self._samples.both_until_ns
         if newest_ns is not None:
             late = seconds_between(pair.current_ns, newest_ns)
             if abs(late) > _LONGEST_DELAY:
                 self.counts['late'] += 1
-                raise InputError('a pair is not used, as its times differ by '
-                                 f'{abs(late):.0f} s from those of the newest samples: camera and '
-                                 'IMU must have one clock; was one of them set?')
+                raise InputError(
+                    'a pair is not used, as its times differ by '
+                    f'{abs(late):.0f} s from those of the newest samples: camera and '
+                    'IMU must have one clock; was one of them set?'
+                )
         if pair.images is None and not pair.contradiction:
             self.counts['without images'] += 1
             self._unusable_ns = pair.current_ns
@@ -311,8 +331,9 @@ class OdometryEstimator:
         if interval is None:
             return None
         stamp_ns = run.stamps[-1][0] + imu_ns - run.newest_ns
-        return self._odometry(run, run.graph.propagated(interval), interval.rates[-1], stamp_ns,
-                              imu_ns)
+        return self._odometry(
+            run, run.graph.propagated(interval), interval.rates[-1], stamp_ns, imu_ns
+        )
 
     def smoothed(self) -> list[Odometry]:
         """All keyframes, given all measurements; needs `keep`."""
@@ -330,8 +351,12 @@ class OdometryEstimator:
             except GraphError as error:
                 self._warnings.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
                 continue
-            out.append([(state, self._odometry(run, state, np.full(3, math.nan), *stamps))
-                        for state, stamps in zip(states, run.stamps, strict=True)])
+            out.append(
+                [
+                    (state, self._odometry(run, state, np.full(3, math.nan), *stamps))
+                    for state, stamps in zip(states, run.stamps, strict=True)
+                ]
+            )
         return out
 
     def close_loops(self, pairs: Iterable[KeyframePair]) -> list[KeyframePair]:
@@ -345,9 +370,16 @@ class OdometryEstimator:
         for run in self._runs:
             numbers = {imu_ns: k for k, (_, imu_ns) in enumerate(run.stamps)}
             try:
-                taken += [loop.pair for loop in run.graph.add_loops([
-                    Loop(numbers[pair.reference_ns], numbers[pair.current_ns], pair)
-                    for pair in loops if {pair.reference_ns, pair.current_ns} <= numbers.keys()])]
+                taken += [
+                    loop.pair
+                    for loop in run.graph.add_loops(
+                        [
+                            Loop(numbers[pair.reference_ns], numbers[pair.current_ns], pair)
+                            for pair in loops
+                            if {pair.reference_ns, pair.current_ns} <= numbers.keys()
+                        ]
+                    )
+                ]
             except GraphError as error:
                 self._warnings.append(f'loops of {len(run.stamps)} keyframes not added: {error}')
         return taken
@@ -361,8 +393,11 @@ class OdometryEstimator:
             return False
         if newest >= pair.current_ns + _LATE_NS:
             return True
-        return (self._run is not None and abs(pair.reference_ns - self._run.newest_ns) < _SAME_NS
-                and self._samples.complete(pair.reference_ns, pair.current_ns))
+        return (
+            self._run is not None
+            and abs(pair.reference_ns - self._run.newest_ns) < _SAME_NS
+            and self._samples.complete(pair.reference_ns, pair.current_ns)
+        )
 
     def _process(self, pair: KeyframePair) -> Odometry | None:
         self._offset_ns = pair.stamp_ns - pair.current_ns
@@ -377,7 +412,7 @@ class OdometryEstimator:
             self._unusable_ns = pair.current_ns
             return None
         if self._run is not None and pair.reference_ns < self._run.newest_ns - _SAME_NS:
-            self.counts['late'] += 1   # the IMU bridges it
+            self.counts['late'] += 1  # the IMU bridges it
             return None
         run = self._continued(pair)
         if run is None:
@@ -390,14 +425,17 @@ class OdometryEstimator:
             return None
         at_rest = pair.is_pure_rotation and interval.at_rest
         # Pairs that deviate together are wrong together: their covariance is too small by that.
-        recent = [innovation for at_ns, innovation, _ in run.recent
-                  if at_ns > pair.current_ns - _RECENT_NS]
+        recent = [
+            innovation
+            for at_ns, innovation, _ in run.recent
+            if at_ns > pair.current_ns - _RECENT_NS
+        ]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
         # The gyro predicts a rotation before the scale is known.
-        gate = (inflation * _CONTRADICTING if run.published or pair.is_pure_rotation
-                else math.inf)
-        innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED * inflation,
-                                   gate=gate)
+        gate = inflation * _CONTRADICTING if run.published or pair.is_pure_rotation else math.inf
+        innovation = run.graph.add(
+            interval, pair, at_rest, inflation=_SHARED * inflation, gate=gate
+        )
         run.stamps.append((pair.stamp_ns, pair.current_ns))
         run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
@@ -415,8 +453,9 @@ class OdometryEstimator:
         if not run.published and not self._known(run):
             return None
         self._corrections += 1
-        return self._odometry(run, run.graph.newest, interval.rates[-1], pair.stamp_ns,
-                              pair.current_ns)
+        return self._odometry(
+            run, run.graph.newest, interval.rates[-1], pair.stamp_ns, pair.current_ns
+        )
 
     def _reject(self, run: _Run, pair: KeyframePair) -> None:
         """Count a pair that contradicts the path, which ends if too many do."""
@@ -456,8 +495,9 @@ class OdometryEstimator:
             return
         until_ns = imu_ns - _LATE_NS
         if until_ns > run.newest_ns and any(
-                series.coverage(run.newest_ns, until_ns) is Coverage.NEVER
-                for series in (self._samples.gyro, self._samples.force)):
+            series.coverage(run.newest_ns, until_ns) is Coverage.NEVER
+            for series in (self._samples.gyro, self._samples.force)
+        ):
             self._end(_GAP, imu_ns)
             return
         age = seconds_between(run.observed_ns, imu_ns)
@@ -471,8 +511,9 @@ class OdometryEstimator:
             self._end(f'no usable pair for {self._config.max_coast:g} s', imu_ns)
             return
         now = _variances(run.graph.propagated(interval))
-        position, heading = (math.sqrt(max(new - old, 0.0))
-                             for new, old in zip(now, run.variances, strict=True))
+        position, heading = (
+            math.sqrt(max(new - old, 0.0)) for new, old in zip(now, run.variances, strict=True)
+        )
         if position > self._config.max_position_sigma:
             self._end(f'the position is known to {position:.2f} m', imu_ns)
         elif heading > self._config.max_heading_sigma:
@@ -483,7 +524,7 @@ class OdometryEstimator:
         silent_ns = imu_ns - self._arrived_ns
         if self._unusable_ns > run.observed_ns:
             return _OVERDUE
-        if 0 < self._frame_interval_ns < NANOSECONDS:   # of a topic with each frame
+        if 0 < self._frame_interval_ns < NANOSECONDS:  # of a topic with each frame
             silent = silent_ns > _SILENT_FRAMES * self._frame_interval_ns
             return _OVERDUE if silent else self._longest_interval + _PAIR_DELAY
         usual = max((seconds for *_, seconds in run.recent), default=0.0)
@@ -500,9 +541,11 @@ class OdometryEstimator:
         at_rest = pair.is_pure_rotation and interval.at_rest
         if self._wrong_starts >= _WRONG_STARTS if at_rest else not pair.has_direction:
             return None
-        moving = (pair.baseline * pair.images.velocities[:3]
-                  if pair.baseline_log_sigma < _START_LOG_SIGMA
-                  else _GUESSED_SPEED * pair.images.t)
+        moving = (
+            pair.baseline * pair.images.velocities[:3]
+            if pair.baseline_log_sigma < _START_LOG_SIGMA
+            else _GUESSED_SPEED * pair.images.t
+        )
         bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
         rate = interval.rates[0] - bias
         if at_rest or before is None or before.duration < interval.duration:
@@ -517,20 +560,35 @@ class OdometryEstimator:
         velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, self._arm))
         of_bias = max(self._imu.accel_bias_sigma, _ACCEL_BIAS)
         tilt = of_bias / STANDARD_GRAVITY if at_rest else _MOVING_TILT
-        covariance = np.diag(np.square(
-            [_GAUGE_SIGMA] * 6 + [_REST_VELOCITY if at_rest else _ANY_VELOCITY] * 3
-            + [of_bias] * 3 + [self._imu.gyro_bias_sigma] * 3 + [0.0] * 3))
+        covariance = np.diag(
+            np.square(
+                [_GAUGE_SIGMA] * 6
+                + [_REST_VELOCITY if at_rest else _ANY_VELOCITY] * 3
+                + [of_bias] * 3
+                + [self._imu.gyro_bias_sigma] * 3
+                + [0.0] * 3
+            )
+        )
         covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _GAUGE_SIGMA])) @ R
         covariance[ARM, ARM] = self._arm_covariance
-        start = KeyframeState(R, path_end.position, velocity, bias, np.zeros(3), self._arm,
-                              covariance)
+        start = KeyframeState(
+            R, path_end.position, velocity, bias, np.zeros(3), self._arm, covariance
+        )
         graph = KeyframeGraph(start, C, self._imu, self._config, keep=self._keep)
         self._first_R = R if self._first_R is None else self._first_R
         offset = pair.current_ns - pair.stamp_ns
-        stamps = deque([(pair.reference_ns - offset, pair.reference_ns)],
-                       maxlen=None if self._keep else 1)
-        return _Run(graph, path_end, at_rest, pair.reference_ns, pair.reference_ns, stamps,
-                    self.base.frame_id or pair.frame_id)
+        stamps = deque(
+            [(pair.reference_ns - offset, pair.reference_ns)], maxlen=None if self._keep else 1
+        )
+        return _Run(
+            graph,
+            path_end,
+            at_rest,
+            pair.reference_ns,
+            pair.reference_ns,
+            stamps,
+            self.base.frame_id or pair.frame_id,
+        )
 
     def _path_end_at(self, imu_ns: int) -> _PathEnd:
         """End of the last path, propagated by the IMU to a time."""
@@ -541,16 +599,21 @@ class OdometryEstimator:
         interval = self._samples.between(run.newest_ns, imu_ns)
         # Uncertainty of earlier losses remains.
         earlier = run.path_end
-        variance = earlier.position_sigma**2 + earlier.heading_sigma**2 * float(
-            ((state.position - earlier.position)[:2]**2).sum()) / 3.0
+        variance = (
+            earlier.position_sigma**2
+            + earlier.heading_sigma**2
+            * float(((state.position - earlier.position)[:2] ** 2).sum())
+            / 3.0
+        )
         turned = moved = 0.0
         if interval is not None and seconds <= _LONGEST_PROPAGATED:
             state = run.graph.propagated(interval)
-        elif abs(seconds) > _SAME_NS / NANOSECONDS:   # else the keyframe itself: no gap
+        elif abs(seconds) > _SAME_NS / NANOSECONDS:  # else the keyframe itself: no gap
             # On at the same velocity; for an unknown time if the clock was set back.
             way = max(seconds, 0.0) * state.velocity
-            unknown = 0.0 if seconds > 0.0 else _UNKNOWN_TIME * float(
-                np.linalg.norm(state.velocity))
+            unknown = (
+                0.0 if seconds > 0.0 else _UNKNOWN_TIME * float(np.linalg.norm(state.velocity))
+            )
             seconds = seconds if seconds > 0.0 else _UNKNOWN_TIME
             turned = _UNKNOWN_RATE * seconds
             moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2 + unknown
@@ -558,19 +621,22 @@ class OdometryEstimator:
             variance += seconds**2 * float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
         of_position, of_heading = _variances(state)
         return _PathEnd(
-            state.R, state.position,
+            state.R,
+            state.position,
             min(math.hypot(earlier.heading_sigma, math.sqrt(of_heading), turned), math.pi),
-            math.sqrt(variance + of_position / 3.0 + moved**2))
+            math.sqrt(variance + of_position / 3.0 + moved**2),
+        )
 
     def _known(self, run: _Run) -> bool:
         """Whether the scale of a starting run is known."""
         seconds = seconds_between(run.first_ns, run.newest_ns)
         sigma = run.graph.scale_sigma()
-        if self.state is OdometryState.STARTING and \
-                self._wrong_starts < _WRONG_STARTS:
-            self.reason = (f'the speed is known to {100.0 * sigma:.0f} % of '
-                           f'{100.0 * self._config.max_scale_sigma:.0f} %: it needs motion that '
-                           'changes its speed, or standstill')
+        if self.state is OdometryState.STARTING and self._wrong_starts < _WRONG_STARTS:
+            self.reason = (
+                f'the speed is known to {100.0 * sigma:.0f} % of '
+                f'{100.0 * self._config.max_scale_sigma:.0f} %: it needs motion that '
+                'changes its speed, or standstill'
+            )
         if run.at_rest or run.pairs >= _LEAST_PAIRS:
             if max(run.graph.misfit(), run.largest / _GROSS) > _WRONG_START:
                 self._run = None
@@ -587,7 +653,9 @@ class OdometryEstimator:
                 self._change(
                     OdometryState.TRACKING,
                     f'started {"at rest" if run.at_rest else "in motion"} after {seconds:.1f} s, '
-                    f'the scale is known to {100.0 * sigma:.1f} %', run.newest_ns)
+                    f'the scale is known to {100.0 * sigma:.1f} %',
+                    run.newest_ns,
+                )
                 return True
         if seconds > _LONGEST_START:
             self._run = None
@@ -634,8 +702,9 @@ class OdometryEstimator:
             arm, covariance = newest.arm, newest.covariance[ARM, ARM]
         return -C @ arm, np.sqrt(np.diag(C @ covariance @ C.T))
 
-    def _odometry(self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int,
-                  imu_ns: int) -> Odometry:
+    def _odometry(
+        self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int, imu_ns: int
+    ) -> Odometry:
         base, first_R = self.base, self._first_R
         assert base is not None and first_R is not None
         # The base on the body, as the camera: its rotation and position.
@@ -654,13 +723,24 @@ class OdometryEstimator:
         velocity = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
         # A later start has position and heading from the end of the path before.
         position, up = state.position + (state.R - first_R) @ c, np.array([0.0, 0.0, 1.0])
-        by_heading = run.path_end.heading_sigma * np.concatenate([
-            skew(up) @ (state.position + state.R @ c - run.path_end.position), up])
+        by_heading = run.path_end.heading_sigma * np.concatenate(
+            [skew(up) @ (state.position + state.R @ c - run.path_end.position), up]
+        )
         covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
         covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
         return Odometry(
-            stamp_ns, imu_ns, run.frame_id, run.path, self._corrections, R, position, covariance,
-            R.T @ (state.velocity + state.R @ skew(rate) @ c), C @ rate, velocity)
+            stamp_ns,
+            imu_ns,
+            run.frame_id,
+            run.path,
+            self._corrections,
+            R,
+            position,
+            covariance,
+            R.T @ (state.velocity + state.R @ skew(rate) @ c),
+            C @ rate,
+            velocity,
+        )
 
 
 def _variances(state: KeyframeState) -> tuple[float, float]:
@@ -677,8 +757,11 @@ def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
     up = axes @ force / np.linalg.norm(force)
     # The smallest rotation that takes it upwards, then one about z to the last heading.
     turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
-    R = (np.eye(3) + turn + turn @ turn / (1.0 + up[2]) if up[2] > -0.999
-         else np.diag([1.0, -1.0, -1.0]))
+    R = (
+        np.eye(3) + turn + turn @ turn / (1.0 + up[2])
+        if up[2] > -0.999
+        else np.diag([1.0, -1.0, -1.0])
+    )
     R = R @ axes
     if path_end.R is not None:
         M = path_end.R @ R.T

@@ -43,9 +43,18 @@ _SAME_NS = 1_000_000
 MOST_POINTS = 50_000
 
 
-def export_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                trajectory: Path, to: str, images: str = '', rate: float = 0.0,
-                most_points: int = MOST_POINTS, store: Path | None = None) -> dict[str, Any]:
+def export_into(
+    folder: Path,
+    bag: Bag,
+    topics: SensorTopics,
+    parameters: Parameters,
+    trajectory: Path,
+    to: str,
+    images: str = '',
+    rate: float = 0.0,
+    most_points: int = MOST_POINTS,
+    store: Path | None = None,
+) -> dict[str, Any]:
     """Write a bag's images, cameras and points into an empty folder; content of export.json.
 
     `trajectory`: folder of `rs_relpose odometry` with the same bag. `to`: the format. `images`
@@ -70,10 +79,13 @@ def export_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             run.leave_out(outcome.stamp_ns, unused_reason(outcome))
     if not run.views:
         reasons = Counter(one['reason'] for one in run.left_out)
-        reason = max(reasons, key=reasons.__getitem__, default='none is a keyframe of the '
-                     'trajectory')
-        raise InputError(f'no image of {bag.path} can be exported: {reason}. Is the trajectory '
-                         'that of this bag?')
+        reason = max(
+            reasons, key=reasons.__getitem__, default='none is a keyframe of the trajectory'
+        )
+        raise InputError(
+            f'no image of {bag.path} can be exported: {reason}. Is the trajectory '
+            'that of this bag?'
+        )
     model = run.model()
     exported = derotated(model, rows) if kind == UNROLLED else model
     exported = replace(exported, camera=formats.fitted(exported.camera, chosen.radial))
@@ -81,12 +93,22 @@ def export_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     chosen.write(exported, folder)
     _draw(model, rows, folder / PICTURE)
     report = {
-        'format': to, 'images': len(model.names), 'image_kind': kind, 'points': len(model.points),
-        'observations': len(model.pixels), 'reprojection_px': reprojection, 'formula_px': formula,
-        'left_out': run.left_out, 'trajectory_gaps_ns': [
-            (end, begin) for end, begin in zip(
-                rows.spans[:-1, 1].tolist(), rows.spans[1:, 0].tolist(), strict=True)
-            if begin > end]}
+        'format': to,
+        'images': len(model.names),
+        'image_kind': kind,
+        'points': len(model.points),
+        'observations': len(model.pixels),
+        'reprojection_px': reprojection,
+        'formula_px': formula,
+        'left_out': run.left_out,
+        'trajectory_gaps_ns': [
+            (end, begin)
+            for end, begin in zip(
+                rows.spans[:-1, 1].tolist(), rows.spans[1:, 0].tolist(), strict=True
+            )
+            if begin > end
+        ],
+    }
     (folder / REPORT_FILE).write_text(json.dumps(report, indent=1) + '\n', encoding='utf-8')
     return report
 
@@ -97,7 +119,7 @@ class _View(NamedTuple):
     name: str
     stamp_ns: int
     reference_ns: int
-    times_ns: Ints   # (3,)
+    times_ns: Ints  # (3,)
 
 
 @dataclass(slots=True, eq=False)
@@ -108,18 +130,18 @@ class _Frames:
     rows: RowTrajectory
     tracks: Tracks
     parameters: Parameters
-    kind: str   # of images
+    kind: str  # of images
     rate: float
     most_points: int
     store: Path | None
     unroller: Unroller = field(default_factory=Unroller)
     views: list[_View] = field(default_factory=list)
-    left_out: list[dict[str, Any]] = field(default_factory=list)   # stamps and reasons
+    left_out: list[dict[str, Any]] = field(default_factory=list)  # stamps and reasons
     next_ns: int = 0
     # From the first frame on.
     sensor: Sensor = field(init=False)
     landmarks: Landmarks | None = None
-    order: Ints = field(init=False)   # of the observations, by keyframes
+    order: Ints = field(init=False)  # of the observations, by keyframes
     colors: NDArray[np.uint8] = field(init=False)
 
     def leave_out(self, stamp_ns: int, reason: str) -> None:
@@ -128,8 +150,9 @@ class _Frames:
 
     def add(self, frame: Frame[GlobalShutterFrame]) -> None:
         """Take colours of points from a frame, and write it if it is chosen."""
-        sensor = sensor_model(frame.intrinsics, self.parameters.sensor,
-                              self.unroller.applied.readout_time)
+        sensor = sensor_model(
+            frame.intrinsics, self.parameters.sensor, self.unroller.applied.readout_time
+        )
         if self.landmarks is None:
             self.landmarks = triangulated(self.tracks, self.rows, sensor, self.most_points)
             self.colors = np.full((len(self.landmarks.positions), 3), 128, dtype=np.uint8)
@@ -141,21 +164,26 @@ class _Frames:
             u, v = np.rint(self.landmarks.observations.pixels[found]).astype(int).T
             height, width = frame.image.shape[:2]
             self.colors[self.landmarks.points[found]] = _rgb(
-                frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], frame.encoding)
+                frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], frame.encoding
+            )
         if not self._is_chosen(at_ns):
             return
         if frame.intrinsics != self.sensor.intrinsics:
             self.leave_out(frame.stamp_ns, 'it has other intrinsics')
             return
         edges = sensor.intrinsics.to_sensor(
-            np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (frame.intrinsics.image_height - 1))
-        times = at_ns + np.rint(NANOSECONDS * np.sort(
-            sensor.camera.row_times(edges[:, 1]))).astype(np.int64)
+            np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (frame.intrinsics.image_height - 1)
+        )
+        times = at_ns + np.rint(
+            NANOSECONDS * np.sort(sensor.camera.row_times(edges[:, 1]))
+        ).astype(np.int64)
         if self.rows.covers(times).all():
             self.views.append(_View(self._write(frame), frame.stamp_ns, at_ns, times))
         else:
-            self.leave_out(frame.stamp_ns, 'there is no pose: it is before, after or in a gap of '
-                           'the trajectory')
+            self.leave_out(
+                frame.stamp_ns,
+                'there is no pose: it is before, after or in a gap of the trajectory',
+            )
 
     def _is_chosen(self, at_ns: int) -> bool:
         if not self.rate:
@@ -163,15 +191,17 @@ class _Frames:
         if at_ns < self.next_ns - _SAME_NS:
             return False
         step = to_nanoseconds(1.0 / self.rate)
-        self.next_ns = max(self.next_ns + step, at_ns + step // 2) if self.next_ns else (
-            at_ns + step)
+        self.next_ns = (
+            max(self.next_ns + step, at_ns + step // 2) if self.next_ns else (at_ns + step)
+        )
         return True
 
     def _observations(self, landmarks: Landmarks, at_ns: int) -> Ints:
         """Indices of the landmarks' observations in an image."""
         keyframes = landmarks.observations.keyframes_ns
-        first, last = np.searchsorted(keyframes, [at_ns - _SAME_NS, at_ns + _SAME_NS + 1],
-                                      sorter=self.order)
+        first, last = np.searchsorted(
+            keyframes, [at_ns - _SAME_NS, at_ns + _SAME_NS + 1], sorter=self.order
+        )
         return self.order[first:last]
 
     def _write(self, frame: Frame[GlobalShutterFrame]) -> str:
@@ -182,11 +212,13 @@ class _Frames:
             suffix, data = ('png' if encoded.is_png else 'jpg'), encoded.data.tobytes()
         elif kind == NO_IMAGES:
             suffix, data = 'png', b''
-        else:   # lossless where the recording is
-            pixels = (frame.result.image() if kind == UNROLLED
-                      else Pixels(frame.image, frame.encoding))
+        else:  # lossless where the recording is
+            pixels = (
+                frame.result.image() if kind == UNROLLED else Pixels(frame.image, frame.encoding)
+            )
             suffix, data = encode_pixels(
-                pixels, png=encoded.is_png or not isinstance(encoded, CompressedImage))
+                pixels, png=encoded.is_png or not isinstance(encoded, CompressedImage)
+            )
         name = f'{frame.stamp_ns:019d}.{suffix.replace("jpeg", "jpg")}'
         if kind != NO_IMAGES:
             target = self.folder / IMAGES / name
@@ -207,11 +239,20 @@ class _Frames:
         order = np.concatenate(parts).astype(np.int64)
         frames = np.repeat(np.arange(len(views)), [len(part) for part in parts])
         return Model(
-            _published(self.sensor), self.parameters.sensor.exposure_time,
-            tuple(view.name for view in views), np.array([view.stamp_ns for view in views]), times,
-            R, p, *self.rows.velocity(times[:, formats.MIDDLE]), landmarks.positions, self.colors,
-            landmarks.errors, np.column_stack([frames, landmarks.points[order]]),
-            landmarks.observations.pixels[order])
+            _published(self.sensor),
+            self.parameters.sensor.exposure_time,
+            tuple(view.name for view in views),
+            np.array([view.stamp_ns for view in views]),
+            times,
+            R,
+            p,
+            *self.rows.velocity(times[:, formats.MIDDLE]),
+            landmarks.positions,
+            self.colors,
+            landmarks.errors,
+            np.column_stack([frames, landmarks.points[order]]),
+            landmarks.observations.pixels[order],
+        )
 
 
 def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
@@ -220,8 +261,9 @@ def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
         values = values // 257
     if values.ndim == 1:
         values = np.repeat(values[:, None], 3, axis=1)
-    return np.asarray(values[:, :3] if encoding.startswith(('rgb', 'mono')) else values[:, 2::-1],
-                      dtype=np.uint8)
+    return np.asarray(
+        values[:, :3] if encoding.startswith(('rgb', 'mono')) else values[:, 2::-1], dtype=np.uint8
+    )
 
 
 def _link(source: Path, target: Path, data: bytes) -> None:
@@ -233,18 +275,27 @@ def _link(source: Path, target: Path, data: bytes) -> None:
                 file.write(data)
         os.link(source, target)
     except OSError as error:
-        raise InputError(f'{target.name} cannot be linked to {source.parent} '
-                         f'({error.strerror}): leave out --link') from error
+        raise InputError(
+            f'{target.name} cannot be linked to {source.parent} '
+            f'({error.strerror}): leave out --link'
+        ) from error
 
 
 def _published(sensor: Sensor) -> RollingShutterCamera:
     """Camera of the published images: region of interest and binning applied."""
     camera, part = sensor.camera, sensor.intrinsics
-    (cx, cy), = part.to_image([[camera.cx, camera.cy]]).tolist()
+    ((cx, cy),) = part.to_image([[camera.cx, camera.cy]]).tolist()
     return replace(
-        camera, width=part.image_width, height=part.image_height, fx=camera.fx / part.binning_x,
-        fy=camera.fy / part.binning_y, cx=cx, cy=cy, readout_time=abs(
-            camera.line_delay) * part.binning_y * part.image_height, reference_row='first')
+        camera,
+        width=part.image_width,
+        height=part.image_height,
+        fx=camera.fx / part.binning_x,
+        fy=camera.fy / part.binning_y,
+        cx=cx,
+        cy=cy,
+        readout_time=abs(camera.line_delay) * part.binning_y * part.image_height,
+        reference_row='first',
+    )
 
 
 def _shown(model: Model, rows: RowTrajectory, k: Ints, pixels: Array) -> Array:
@@ -258,13 +309,21 @@ def derotated(model: Model, rows: RowTrajectory) -> Model:
     """The model of derotated images."""
     middle = [formats.MIDDLE] * 3
     return replace(
-        model, camera=replace(model.camera, readout_time=0.0), R=model.R[:, middle],
-        positions=model.positions[:, middle], times_ns=model.times_ns[:, middle],
-        pixels=_shown(model, rows, model.observed[:, 0], model.pixels))
+        model,
+        camera=replace(model.camera, readout_time=0.0),
+        R=model.R[:, middle],
+        positions=model.positions[:, middle],
+        times_ns=model.times_ns[:, middle],
+        pixels=_shown(model, rows, model.observed[:, 0], model.pixels),
+    )
 
 
-def _deviations(model: Model, exported: Model, rows: RowTrajectory, chosen: Format,
-                ) -> tuple[dict[str, float] | None, dict[str, float] | None]:
+def _deviations(
+    model: Model,
+    exported: Model,
+    rows: RowTrajectory,
+    chosen: Format,
+) -> tuple[dict[str, float] | None, dict[str, float] | None]:
     """Of observed pixels from points at the poses of their rows, and of the format from that.
 
     The latter by its own formula for the place of a point; None without points.
@@ -274,15 +333,19 @@ def _deviations(model: Model, exported: Model, rows: RowTrajectory, chosen: Form
         return None, None
     by_path = formats.projected(formats.path(rows), model, k, points, model.pixels[:, 1])
     shown = by_path if exported.rolls else _shown(model, rows, k, by_path)
-    return _spread(by_path - model.pixels), _spread(formats.projected(
-        chosen.place, exported, k, points, model.pixels[:, 1]) - shown)
+    return _spread(by_path - model.pixels), _spread(
+        formats.projected(chosen.place, exported, k, points, model.pixels[:, 1]) - shown
+    )
 
 
 def _spread(differences: Array) -> dict[str, float]:
     """Of differences (N, 2) [px], of which those that are NaN do not count; most: 95 %."""
     lengths = np.linalg.norm(differences[np.isfinite(differences).all(axis=1)], axis=1)
-    values = [lengths.mean(), *np.percentile(lengths, [50.0, 95.0, 100.0])] if len(lengths) else (
-        [math.nan] * 4)
+    values = (
+        [lengths.mean(), *np.percentile(lengths, [50.0, 95.0, 100.0])]
+        if len(lengths)
+        else ([math.nan] * 4)
+    )
     return dict(zip(('mean', 'median', 'most', 'largest'), map(float, values), strict=True))
 
 
@@ -293,23 +356,38 @@ def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
     axes.scatter(model.points[:, 0], model.points[:, 1], s=1.0, color='0.6', label='points')
     for first, last in rows.spans:
         _, p = rows.pose(first + np.linspace(0, last - first, 2000).astype(np.int64))
-        axes.plot(p[:, 0], p[:, 1], color=BLUE, lw=1.2,
-                  label='path' if first == rows.spans[0, 0] else None)
+        axes.plot(
+            p[:, 0],
+            p[:, 1],
+            color=BLUE,
+            lw=1.2,
+            label='path' if first == rows.spans[0, 0] else None,
+        )
     if len(rows.loops_ns):
         _, ends = rows.pose(rows.loops_ns)
         axes.plot(*ends[..., :2].transpose(2, 1, 0), color=GREEN, lw=0.8)
         axes.plot([], color=GREEN, lw=0.8, label=f'{len(ends)} loops')
     middle = model.positions[:, formats.MIDDLE]
     forward = model.R[:, formats.MIDDLE, :, 2]
-    axes.quiver(middle[:, 0], middle[:, 1], forward[:, 0], forward[:, 1], color=ORANGE,
-                width=2e-3, label='cameras')
-    if len(model.points):   # a few far ones would shrink the rest
+    axes.quiver(
+        middle[:, 0],
+        middle[:, 1],
+        forward[:, 0],
+        forward[:, 1],
+        color=ORANGE,
+        width=2e-3,
+        label='cameras',
+    )
+    if len(model.points):  # a few far ones would shrink the rest
         low, high = np.percentile(model.points[:, :2], [2.0, 98.0], axis=0)
         low, high = np.minimum(low, middle[:, :2].min(0)), np.maximum(high, middle[:, :2].max(0))
         axes.set(xlim=(low[0] - 1.0, high[0] + 1.0), ylim=(low[1] - 1.0, high[1] + 1.0))
     axes.set_aspect('equal', 'box')
-    axes.set(title=f'{len(model.names)} images, {len(model.points)} points, from above',
-             xlabel='x [m]', ylabel='y [m]')
+    axes.set(
+        title=f'{len(model.names)} images, {len(model.points)} points, from above',
+        xlabel='x [m]',
+        ylabel='y [m]',
+    )
     axes.legend()
     axes.grid(alpha=0.3)
     save_picture(picture, path)

@@ -38,7 +38,7 @@ _START_STEPS = 10
 # them; time in which they are forgotten [s] (docs/lab/odometry.md, "Noise by innovations").
 _ACCEL_ERRORS = np.array([0.0, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])[:, None]
 _PAIR_VARIANCES = np.array([0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
-_LIKELY = -0.5 * ((_ACCEL_ERRORS / 8e-3)**2 + (np.log(_PAIR_VARIANCES) / 0.7)**2)
+_LIKELY = -0.5 * ((_ACCEL_ERRORS / 8e-3) ** 2 + (np.log(_PAIR_VARIANCES) / 0.7) ** 2)
 _FORGOTTEN = 20.0
 # Largest share of one pair in that choice, as a difference of log likelihoods.
 _ONE_PAIR = 6.0
@@ -53,7 +53,12 @@ _BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18), slice(18, 21))
 _OF_FIRST, _OF_SECOND = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
 # Columns of the covariance of a keyframe.
 POSE, VELOCITY, BIAS, GYRO_BIAS, ARM = (
-    slice(0, 6), slice(6, 9), slice(9, 15), slice(12, 15), slice(15, 18))
+    slice(0, 6),
+    slice(6, 9),
+    slice(9, 15),
+    slice(12, 15),
+    slice(15, 18),
+)
 
 
 class GraphError(RsRelposeError):
@@ -69,7 +74,7 @@ class KeyframeState:
     velocity: Array
     gyro_bias: Array
     accel_bias: Array
-    arm: Array   # (3,) position of the camera in the body [m]
+    arm: Array  # (3,) position of the camera in the body [m]
     # (18, 18) of rotation and translation in the axes of the body, velocity in the world, biases
     # of accelerometer and gyro, arm.
     covariance: Array
@@ -78,7 +83,7 @@ class KeyframeState:
 class Loop(NamedTuple):
     """A pair of two keyframes of a graph, far apart in time."""
 
-    first: int   # their numbers since the start
+    first: int  # their numbers since the start
     second: int
     pair: KeyframePair
 
@@ -107,9 +112,9 @@ def _optimizer(iterations: int = 10) -> Any:
 class _Innovation(NamedTuple):
     """A pair against all before it and the samples."""
 
-    errors: Array   # (n,) in units of the pair's sigmas
-    covariance: Array   # (n, n) without the pair's own
-    by_accelerometer: Array   # (n, n) change of that by the variance of the accelerometer's noise
+    errors: Array  # (n,) in units of the pair's sigmas
+    covariance: Array  # (n, n) without the pair's own
+    by_accelerometer: Array  # (n, n) change of that by the variance of the accelerometer's noise
 
     @property
     def chi_squared(self) -> float:
@@ -128,14 +133,16 @@ class _Noise:
     def observe(self, innovation: _Innovation, seconds: float) -> None:
         """Use an innovation; `seconds`: since the one before."""
         known, vectors = np.linalg.eigh(
-            innovation.covariance + (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None]
-            * innovation.by_accelerometer)
-        squared = (innovation.errors @ vectors)[:, None]**2
+            innovation.covariance
+            + (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None] * innovation.by_accelerometer
+        )
+        squared = (innovation.errors @ vectors)[:, None] ** 2
         variances = np.maximum(known, 0.0)[:, None] + _PAIR_VARIANCES[:, None]
         log = -0.5 * (squared / variances + np.log(variances)).sum(axis=2)
         kept = math.exp(-seconds / _FORGOTTEN)
-        self._log = (kept * self._log + (1.0 - kept) * _LIKELY
-                     + np.maximum(log - log.max(), -_ONE_PAIR))
+        self._log = (
+            kept * self._log + (1.0 - kept) * _LIKELY + np.maximum(log - log.max(), -_ONE_PAIR)
+        )
         self._read()
 
     def _read(self) -> None:
@@ -151,8 +158,15 @@ class KeyframeGraph:
     `newest`: with its covariance in the window. `keep`: whether all is recorded for `smoothed`.
     """
 
-    def __init__(self, start: KeyframeState, R_cam_body: Array, imu: ImuConfig,
-                 config: OdometryConfig, *, keep: bool = False) -> None:
+    def __init__(
+        self,
+        start: KeyframeState,
+        R_cam_body: Array,
+        imu: ImuConfig,
+        config: OdometryConfig,
+        *,
+        keep: bool = False,
+    ) -> None:
         self._R_cam_body, self._config = R_cam_body, config
         self._preintegration, self._imu = _preintegration(imu, config), imu
         self._noise = _Noise()
@@ -170,8 +184,9 @@ class KeyframeGraph:
         values.insert(B(0), bias)
         values.insert(L(0), start.arm)
         factors.addPriorPose3(X(0), pose, _gaussian(start.covariance[POSE, POSE]))
-        factors.addPriorVector(V(0), start.velocity,
-                               _gaussian(start.covariance[VELOCITY, VELOCITY]))
+        factors.addPriorVector(
+            V(0), start.velocity, _gaussian(start.covariance[VELOCITY, VELOCITY])
+        )
         factors.addPriorConstantBias(B(0), bias, _gaussian(start.covariance[BIAS, BIAS]))
         factors.addPriorVector(L(0), start.arm, _gaussian(start.covariance[ARM, ARM]))
         self._update(factors, values, 0, 0.0)
@@ -180,12 +195,23 @@ class KeyframeGraph:
         """The body after samples since the newest keyframe, without a new keyframe."""
         by, noise = self._linearised(self._predicted(interval))
         pose = self._ahead.atPose3(X(self._count))
-        return replace(self.newest, R=pose.rotation().matrix(), position=pose.translation(),
-                       velocity=self._ahead.atVector(V(self._count)),
-                       covariance=by @ self.newest.covariance @ by.T + noise)
+        return replace(
+            self.newest,
+            R=pose.rotation().matrix(),
+            position=pose.translation(),
+            velocity=self._ahead.atVector(V(self._count)),
+            covariance=by @ self.newest.covariance @ by.T + noise,
+        )
 
-    def add(self, interval: ImuInterval, pair: KeyframePair | None, at_rest: bool, *,
-            inflation: float = 1.0, gate: float = math.inf) -> float:
+    def add(
+        self,
+        interval: ImuInterval,
+        pair: KeyframePair | None,
+        at_rest: bool,
+        *,
+        inflation: float = 1.0,
+        gate: float = math.inf,
+    ) -> float:
         """Add a keyframe after `interval`, and the pair with the previous one, if any.
 
         `inflation`: of the pair's covariance. Returns the innovation of the pair: its chi squared
@@ -219,9 +245,13 @@ class KeyframeGraph:
             for key in (V(i), V(j)):
                 factors.addPriorVector(key, np.zeros(3), _diagonal([_REST_VELOCITY_SIGMA] * 3))
         # States before a long bridge stay: the first pairs after it correct them, too.
-        self._update(factors, values, j, self._seconds + min(
-            interval.duration, _LONGEST_STEP * self._config.smoothing_lag),
-            _START_STEPS if pair is not None and gate == math.inf else 1)
+        self._update(
+            factors,
+            values,
+            j,
+            self._seconds + min(interval.duration, _LONGEST_STEP * self._config.smoothing_lag),
+            _START_STEPS if pair is not None and gate == math.inf else 1,
+        )
         return innovation
 
     def scale_sigma(self) -> float:
@@ -231,9 +261,10 @@ class KeyframeGraph:
 
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""
-        graph: Any = self._smoother.getFactors()   # removed ones are None
-        equations = sum(factor.dim() for k in range(graph.size())
-                        if (factor := graph.at(k)) is not None)
+        graph: Any = self._smoother.getFactors()  # removed ones are None
+        equations = sum(
+            factor.dim() for k in range(graph.size()) if (factor := graph.at(k)) is not None
+        )
         return 2.0 * graph.error(self._values) / max(equations - self._values.dim(), 1)
 
     def smoothed(self) -> list[KeyframeState]:
@@ -253,8 +284,9 @@ class KeyframeGraph:
             misfits = [self._misfit(loop, values, marginals) for loop in loops]
             bound = 1.0
             while True:
-                loops = [loop for loop, misfit in zip(loops, misfits, strict=True)
-                         if misfit <= bound]
+                loops = [
+                    loop for loop, misfit in zip(loops, misfits, strict=True) if misfit <= bound
+                ]
                 graph, values = self._closed(loops, values)
                 misfits = [self._misfit(loop, values) for loop in loops]
                 worst = max(misfits, default=0.0)
@@ -282,10 +314,11 @@ class KeyframeGraph:
         S = np.eye(len(e))
         if marginals is not None:
             # About the predicted pose: the tangents of other directions have steeper derivatives.
-            A, _ = self._pair_factor(*self._predicted_loop(loop, values)).linearize(
-                values).jacobian()
+            A, _ = (
+                self._pair_factor(*self._predicted_loop(loop, values)).linearize(values).jacobian()
+            )
             S += A @ _joint(marginals, list(factor.keys())) @ A.T
-        return float(e @ np.linalg.solve(S, e)) / _loop_bound(len(e))**2
+        return float(e @ np.linalg.solve(S, e)) / _loop_bound(len(e)) ** 2
 
     def _predicted_loop(self, loop: Loop, values: Any) -> Loop:
         """The same of the poses of a path."""
@@ -293,9 +326,16 @@ class KeyframeGraph:
         assert images is not None
         way = values.atPose3(X(loop.first)).between(values.atPose3(X(loop.second)))
         R, q = way.rotation().matrix(), way.transformFrom(c) - c
-        return loop._replace(pair=replace(loop.pair, images=replace(
-            images, R=C @ R @ C.T, t=C @ q / np.linalg.norm(q) if loop.pair.has_direction
-            else images.t)))
+        return loop._replace(
+            pair=replace(
+                loop.pair,
+                images=replace(
+                    images,
+                    R=C @ R @ C.T,
+                    t=C @ q / np.linalg.norm(q) if loop.pair.has_direction else images.t,
+                ),
+            )
+        )
 
     def _smoothed(self) -> tuple[Any, Any]:
         """Values and marginals of the whole record."""
@@ -310,17 +350,22 @@ class KeyframeGraph:
         By the mean of two samples each; those of the prediction before are not repeated.
         """
         (known, pim), n = self._integrated, 1
-        if known and all(np.array_equal(old, new[:len(old)])
-                         for old, new in zip(known, interval, strict=True)):
+        if known and all(
+            np.array_equal(old, new[: len(old)]) for old, new in zip(known, interval, strict=True)
+        ):
             n = len(known.seconds)
         else:
-            self._preintegration.setAccelerometerCovariance((
-                self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3))
+            self._preintegration.setAccelerometerCovariance(
+                (self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3)
+            )
             pim = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
-        seconds, rates, forces = (samples[n - 1:] for samples in interval)
-        for force, rate, step in zip(0.5 * (forces[1:] + forces[:-1]),
-                                     0.5 * (rates[1:] + rates[:-1]), np.diff(seconds),
-                                     strict=True):
+        seconds, rates, forces = (samples[n - 1 :] for samples in interval)
+        for force, rate, step in zip(
+            0.5 * (forces[1:] + forces[:-1]),
+            0.5 * (rates[1:] + rates[:-1]),
+            np.diff(seconds),
+            strict=True,
+        ):
             pim.integrateMeasurement(force, rate, step)
         self._integrated = interval, pim
         state = pim.predict(self._nav_state, self._bias)
@@ -354,37 +399,65 @@ class KeyframeGraph:
         seconds, R = pim.deltaTij(), self._ahead.atPose3(X(self._count)).rotation().matrix()
         of_velocity = second[:, VELOCITY] @ R
         of_both = second[:, 3:6] + (1.5 / seconds) * of_velocity
-        by_accelerometer = (seconds**3 / 3.0 * of_both @ of_both.T
-                            + seconds / 4.0 * of_velocity @ of_velocity.T)
-        return _Innovation(e, whole @ self.newest.covariance @ whole.T
-                           + second @ noise @ second.T, by_accelerometer)
+        by_accelerometer = (
+            seconds**3 / 3.0 * of_both @ of_both.T + seconds / 4.0 * of_velocity @ of_velocity.T
+        )
+        return _Innovation(
+            e,
+            whole @ self.newest.covariance @ whole.T + second @ noise @ second.T,
+            by_accelerometer,
+        )
 
-    def _pair_factor(self, i: int, j: int, pair: KeyframePair, rates: Array | None = None,
-                     sigma: float = 1.0, *, robust: bool = False) -> Any:
+    def _pair_factor(
+        self,
+        i: int,
+        j: int,
+        pair: KeyframePair,
+        rates: Array | None = None,
+        sigma: float = 1.0,
+        *,
+        robust: bool = False,
+    ) -> Any:
         images = pair.images
         assert images is not None
         C = self._R_cam_body
         root, offset = square_root(images.information, images.gradient)
         n, R = root.shape[1], images.R
         # A pure rotation has no other deviations.
-        t, velocities = (images.t, images.velocities) if pair.has_direction else (
-            np.array([0.0, 0.0, 1.0]), np.zeros(6))
+        t, velocities = (
+            (images.t, images.velocities)
+            if pair.has_direction
+            else (np.array([0.0, 0.0, 1.0]), np.zeros(6))
+        )
         # Only velocities depend on the rates.
         w1, w2 = np.zeros((2, 3)) if rates is None else rates
         noise = _diagonal([sigma] * len(offset))
         if robust:
             noise = gtsam.noiseModel.Robust.Create(
-                gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset))), noise)
+                gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset))), noise
+            )
 
         keys = x1, v1, x2, v2, arm = [X(i), V(i), X(j), V(j), L(0)]
 
         def error(_: Any, values: Any, jacobians: Any) -> Array:
             P1, P2 = values.atPose3(x1).matrix(), values.atPose3(x2).matrix()
             e, by = deviations(
-                P1[:3, :3].copy(), P1[:3, 3], values.atVector(v1), w1, P2[:3, :3].copy(),
-                P2[:3, 3], values.atVector(v2), w2, C, values.atVector(arm), R, t, velocities)
+                P1[:3, :3].copy(),
+                P1[:3, 3],
+                values.atVector(v1),
+                w1,
+                P2[:3, :3].copy(),
+                P2[:3, 3],
+                values.atVector(v2),
+                w2,
+                C,
+                values.atVector(arm),
+                R,
+                t,
+                velocities,
+            )
             if jacobians is not None:
-                whole = (by[:n].T @ root.T).T   # column-major, as gtsam requires
+                whole = (by[:n].T @ root.T).T  # column-major, as gtsam requires
                 for block, columns in enumerate(_BLOCKS):
                     jacobians[block] = whole[:, columns]
             return np.asarray(root @ e[:n] + offset)
@@ -408,17 +481,17 @@ class KeyframeGraph:
 
         return gtsam.CustomFactor(_diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
 
-    def _update(self, factors: Any, values: Any, newest: int, seconds: float,
-                steps: int = 1) -> None:
+    def _update(
+        self, factors: Any, values: Any, newest: int, seconds: float, steps: int = 1
+    ) -> None:
         """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
         with _solving():
             # The camera on the body stays in the window.
-            self._smoother.update(factors, values,
-                                  dict.fromkeys([*values.keys(), L(0)], seconds))
+            self._smoother.update(factors, values, dict.fromkeys([*values.keys(), L(0)], seconds))
             for _ in range(steps - 1):
                 self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
             self._read(newest)
-        self._count, self._seconds = newest + 1, seconds   # keyframes; time of the newest
+        self._count, self._seconds = newest + 1, seconds  # keyframes; time of the newest
         if self._record is not None:
             self._record[0].push_back(factors)
 
@@ -426,10 +499,12 @@ class KeyframeGraph:
         """Read the estimates of the smoother."""
         self._values = self._smoother.calculateEstimate()
         self._bias = self._values.atConstantBias(B(newest))
-        self.newest = _state(self._values, gtsam.Marginals(
-            self._smoother.getFactors(), self._values), newest)
-        self._nav_state = gtsam.NavState(self._values.atPose3(X(newest)),
-                                         self._values.atVector(V(newest)))
+        self.newest = _state(
+            self._values, gtsam.Marginals(self._smoother.getFactors(), self._values), newest
+        )
+        self._nav_state = gtsam.NavState(
+            self._values.atPose3(X(newest)), self._values.atVector(V(newest))
+        )
         # The window, with a place for the prediction of the next keyframe.
         self._ahead = gtsam.Values(self._values)
         self._ahead.insert(X(newest + 1), self._nav_state.pose())
@@ -451,7 +526,7 @@ def _solving() -> Iterator[None]:
     """Raise a failure of gtsam as GraphError."""
     try:
         yield
-    except RuntimeError as error:   # of several lines
+    except RuntimeError as error:  # of several lines
         first_line = str(error).strip().partition('\n')[0]
         raise GraphError(f'the graph cannot be solved: {first_line}') from error
 
@@ -459,9 +534,14 @@ def _solving() -> Iterator[None]:
 def _state(values: Any, marginals: Any, k: int) -> KeyframeState:
     pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
     return KeyframeState(
-        pose.rotation().matrix(), pose.translation(), values.atVector(V(k)), bias.gyroscope(),
-        bias.accelerometer(), values.atVector(L(0)),
-        _joint(marginals, [X(k), V(k), B(k), L(0)]))
+        pose.rotation().matrix(),
+        pose.translation(),
+        values.atVector(V(k)),
+        bias.gyroscope(),
+        bias.accelerometer(),
+        values.atVector(L(0)),
+        _joint(marginals, [X(k), V(k), B(k), L(0)]),
+    )
 
 
 def _joint(marginals: Any, keys: list[int]) -> Array:

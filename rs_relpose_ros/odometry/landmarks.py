@@ -30,20 +30,26 @@ class Tracks(ArrayFile):
     """Inliers of keyframe pairs (N,), in the order of tracks and time."""
 
     ids: Ints
-    keyframes_ns: Ints   # time of the image's reference row on the clock of the IMU
-    times_ns: Ints   # of the observed row
-    pixels: Array   # (N, 2) of the published image
+    keyframes_ns: Ints  # time of the image's reference row on the clock of the IMU
+    times_ns: Ints  # of the observed row
+    pixels: Array  # (N, 2) of the published image
 
     @classmethod
     def of_pair(cls, pair: PairResult) -> Tracks:
         """Of both images."""
         found, matches = pair.pose.inliers, pair.matches
         ids = matches.track_ids[found].astype(np.int64)
-        rows = [np.rint(NANOSECONDS * row_times[found]).astype(np.int64)
-                for row_times in (pair.row_times1, pair.row_times2)]
+        rows = [
+            np.rint(NANOSECONDS * row_times[found]).astype(np.int64)
+            for row_times in (pair.row_times1, pair.row_times2)
+        ]
         keyframes = np.repeat([pair.reference_ns1, pair.reference_ns2], len(ids))
-        return cls(np.tile(ids, 2), keyframes, keyframes + np.concatenate(rows),
-                   np.concatenate([matches.points1[found], matches.points2[found]]))
+        return cls(
+            np.tile(ids, 2),
+            keyframes,
+            keyframes + np.concatenate(rows),
+            np.concatenate([matches.points1[found], matches.points2[found]]),
+        )
 
     @classmethod
     def merged(cls, parts: Sequence[Tracks]) -> Tracks:
@@ -51,10 +57,12 @@ class Tracks(ArrayFile):
         if not parts:
             nothing = np.zeros(0, dtype=np.int64)
             return cls(nothing, nothing, nothing, np.zeros((0, 2)))
-        whole = cls(*(np.concatenate([getattr(part, one.name) for part in parts])
-                      for one in fields(cls)))
-        _, first = np.unique(np.column_stack([whole.ids, whole.keyframes_ns]), axis=0,
-                             return_index=True)
+        whole = cls(
+            *(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls))
+        )
+        _, first = np.unique(
+            np.column_stack([whole.ids, whole.keyframes_ns]), axis=0, return_index=True
+        )
         return whole.kept(first)
 
     def kept(self, which: NDArray[np.bool_] | Ints) -> Tracks:
@@ -66,10 +74,10 @@ class Tracks(ArrayFile):
 class Landmarks:
     """Points in the world and their observations; `points`: which point each one is of."""
 
-    positions: Array   # (P, 3) [m]
-    errors: Array   # (P,) mean deviation of the observations [px]
-    points: Ints   # (N,)
-    observations: Tracks   # (N,)
+    positions: Array  # (P, 3) [m]
+    errors: Array  # (P,) mean deviation of the observations [px]
+    points: Ints  # (N,)
+    observations: Tracks  # (N,)
 
 
 def triangulated(tracks: Tracks, rows: RowTrajectory, sensor: Sensor, most: int) -> Landmarks:
@@ -86,7 +94,8 @@ def triangulated(tracks: Tracks, rows: RowTrajectory, sensor: Sensor, most: int)
     good = np.isfinite(rays).all(axis=1)
     normals = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     _, starts, points, counts = np.unique(
-        tracks.ids, return_index=True, return_inverse=True, return_counts=True)
+        tracks.ids, return_index=True, return_inverse=True, return_counts=True
+    )
     enough = (counts >= _LEAST_VIEWS)[points]
     weights: Array = np.ones(len(rays))
     errors: Array = np.zeros(len(rays))
@@ -100,15 +109,17 @@ def triangulated(tracks: Tracks, rows: RowTrajectory, sensor: Sensor, most: int)
         A = np.nan_to_num(normals) * weights[:, None, None]
         # Points without observations stay at the origin.
         towards = summed(np.einsum('nij,nj->ni', A, p))[..., None]
-        positions = np.asarray(np.linalg.solve(
-            summed(A) + 1e-12 * np.eye(3), towards)[..., 0], dtype=np.float64)
+        positions = np.asarray(
+            np.linalg.solve(summed(A) + 1e-12 * np.eye(3), towards)[..., 0], dtype=np.float64
+        )
         local = np.einsum('nji,nj->ni', R, positions[points] - p)
         pixels = intrinsics.to_image(camera.project(local))
-        errors = np.asarray(np.nan_to_num(
-            np.linalg.norm(pixels - tracks.pixels, axis=1), nan=np.inf))
+        errors = np.asarray(
+            np.nan_to_num(np.linalg.norm(pixels - tracks.pixels, axis=1), nan=np.inf)
+        )
         # By the distance, angles count instead of lengths.
         distances = np.maximum(np.linalg.norm(local, axis=1), 1e-3)
-        weights = 1.0 / (distances * (1.0 + (errors / _SCALE)**2))**2
+        weights = 1.0 / (distances * (1.0 + (errors / _SCALE) ** 2)) ** 2
     good &= enough & (errors < _GATE)
     spread = np.linalg.eigvalsh(summed(np.where(good[:, None, None], normals, 0.0)))[:, 0]
     sigmas = 1.0 / (camera.fx * np.sqrt(np.maximum(spread, 1e-12)))

@@ -31,8 +31,10 @@ from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FI
 from rs_relpose_ros.pipeline.pair import PairResult
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
-    'truth': {'color': 'black', 'lw': 2.5}, 'live': {'color': '#E69F00', 'lw': 1.2},
-    'smoothed': {'color': '#0072B2', 'lw': 1.2}}
+    'truth': {'color': 'black', 'lw': 2.5},
+    'live': {'color': '#E69F00', 'lw': 1.2},
+    'smoothed': {'color': '#0072B2', 'lw': 1.2},
+}
 
 LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
 RATE_FILE = 'trajectory_rows.tum'
@@ -46,18 +48,27 @@ class OdometryOutcome:
     smoothed: list[Odometry]
     metrics: dict[str, Any]
     warnings: list[str]
-    blocking_reason: str   # why it could not start
+    blocking_reason: str  # why it could not start
 
 
-def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                  rate: float = 0.0, *, loops: bool = False) -> OdometryOutcome:
+def odometry_into(
+    folder: Path,
+    bag: Bag,
+    topics: SensorTopics,
+    parameters: Parameters,
+    rate: float = 0.0,
+    *,
+    loops: bool = False,
+) -> OdometryOutcome:
     """Run a bag, and write trajectories, tracks and a picture into `folder`.
 
     Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz]. `loops`:
     whether the smoothed path has loop closures.
     """
-    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, RATE_FILE, TRACKS_FILE,
-                            PICTURE, SUMMARY_FILE))
+    prepare_folder(
+        folder,
+        (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, RATE_FILE, TRACKS_FILE, PICTURE, SUMMARY_FILE),
+    )
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
     observed: list[Tracks] = []
@@ -76,24 +87,42 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     if loops and paths:
         assert replay.intake.intrinsics is not None
         sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
-        paths, closed, taken = close_loops(estimator, paths, views, sensor, lambda stamps: [
-            pair for pair in related(bag, topics, parameters, stamps)[0]
-            if isinstance(pair, PairResult)])
+        paths, closed, taken = close_loops(
+            estimator,
+            paths,
+            views,
+            sensor,
+            lambda stamps: [
+                pair
+                for pair in related(bag, topics, parameters, stamps)[0]
+                if isinstance(pair, PairResult)
+            ],
+        )
     smoothed = [keyframe for path in paths for _, keyframe in path]
     warnings = estimator.warnings()
     truth = read_truth(bag, topics)
     # The ground truth is that of the camera.
     base = estimator.base or Base()
-    drawn = {name: path_of([base.camera(pose) for pose in trajectory], truth)
-             for name, trajectory in (('live', live), ('smoothed', smoothed))}
-    metrics = {**_metrics(estimator, live), 'loops': closed,
-               'health': replay.health.state.value,
-               **{name: path.errors and path.errors.as_json() for name, path in drawn.items()}}
+    drawn = {
+        name: path_of([base.camera(pose) for pose in trajectory], truth)
+        for name, trajectory in (('live', live), ('smoothed', smoothed))
+    }
+    metrics = {
+        **_metrics(estimator, live),
+        'loops': closed,
+        'health': replay.health.state.value,
+        **{name: path.errors and path.errors.as_json() for name, path in drawn.items()},
+    }
     write_tum(folder / LIVE_FILE, live)
     write_tum(folder / SMOOTHED_FILE, smoothed)
     if paths:
-        rows = row_trajectory(paths, base, parameters, [
-            sample for _, sample in samples if isinstance(sample, ImuSample)], taken)
+        rows = row_trajectory(
+            paths,
+            base,
+            parameters,
+            [sample for _, sample in samples if isinstance(sample, ImuSample)],
+            taken,
+        )
         rows.save(folder / ROWS_FILE)
         Tracks.merged(observed).save(folder / TRACKS_FILE)
         if rate:
@@ -106,45 +135,94 @@ def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str
     """Counts, intervals, starts and the estimated lever arm, for summary.json."""
     positions = [pose.position for pose in live]
     return {
-        'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
-            'pairs', 'contradicting', 'late', 'without images', 'calibration contradicted')},
-        **{state.value: [
-            {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
-            for one in estimator.intervals if one.state is state]
-           for state in (OdometryState.UNCERTAIN, OdometryState.LOST)},
-        **{name: value.tolist() for name, value in zip(
-            ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True)},
+        'keyframes': len(live),
+        'pairs': {
+            name: estimator.counts[name]
+            for name in (
+                'pairs',
+                'contradicting',
+                'late',
+                'without images',
+                'calibration contradicted',
+            )
+        },
+        **{
+            state.value: [
+                {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
+                for one in estimator.intervals
+                if one.state is state
+            ]
+            for state in (OdometryState.UNCERTAIN, OdometryState.LOST)
+        },
+        **{
+            name: value.tolist()
+            for name, value in zip(
+                ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True
+            )
+        },
         'starts': [asdict(started) for started in estimator.starts],
-        'length_m': float(np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0),
-                                         axis=1).sum())}
+        'length_m': float(
+            np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0), axis=1).sum()
+        ),
+    }
 
 
-def row_trajectory(paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]], base: Base,
-                   parameters: Parameters, samples: Iterable[ImuSample],
-                   loops: Iterable[KeyframePair] = ()) -> RowTrajectory:
+def row_trajectory(
+    paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]],
+    base: Base,
+    parameters: Parameters,
+    samples: Iterable[ImuSample],
+    loops: Iterable[KeyframePair] = (),
+) -> RowTrajectory:
     """Poses at any time, of `OdometryEstimator.smoothed_paths` and the samples of the IMU.
 
     `loops`: those that the paths have, of `close_loops`.
     """
     buffer = ImuSamples(parameters.imu.max_imu_gap)
     for sample in samples:
-        with suppress(InputError):   # not finite: the replay counts and reports it
+        with suppress(InputError):  # not finite: the replay counts and reports it
             buffer.add(sample)
     C, arm = parameters.sensor.R_cam_imu, paths[-1][-1][0].arm
     base_R = C.T @ base.R.T
-    mounts = np.array([np.column_stack(mount) for mount in (
-        (C.T, arm), (np.eye(3), np.zeros(3)), (base_R, arm - base_R @ base.position))])
+    mounts = np.array(
+        [
+            np.column_stack(mount)
+            for mount in (
+                (C.T, arm),
+                (np.eye(3), np.zeros(3)),
+                (base_R, arm - base_R @ base.position),
+            )
+        ]
+    )
     # The cameras' positions are kept: the arm of an earlier path may differ.
-    return RowTrajectory.of_paths([[
-        Knot(keyframe.stamp_ns, keyframe.imu_ns, state.R,
-             base.camera(keyframe).position - state.R @ arm, state.velocity, state.gyro_bias,
-             state.accel_bias, keyframe.pose_covariance)
-        for state, keyframe in path] for path in paths], buffer, mounts, [
-            (loop.reference_ns, loop.current_ns) for loop in loops])
+    return RowTrajectory.of_paths(
+        [
+            [
+                Knot(
+                    keyframe.stamp_ns,
+                    keyframe.imu_ns,
+                    state.R,
+                    base.camera(keyframe).position - state.R @ arm,
+                    state.velocity,
+                    state.gyro_bias,
+                    state.accel_bias,
+                    keyframe.pose_covariance,
+                )
+                for state, keyframe in path
+            ]
+            for path in paths
+        ],
+        buffer,
+        mounts,
+        [(loop.reference_ns, loop.current_ns) for loop in loops],
+    )
 
 
-def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair]],
-           samples: Sequence[tuple[int, ImuSample | int]]) -> list[Odometry]:
+def follow(
+    estimator: OdometryEstimator,
+    pairs: Iterable[tuple[int, KeyframePair]],
+    samples: Sequence[tuple[int, ImuSample | int]],
+) -> list[Odometry]:
     """Keyframes of pairs and samples, both with their times of arrival [ns].
 
     A number among the samples is the stamp of a frame.
@@ -158,7 +236,7 @@ def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair
         live += estimator.take()
     for _, sample in samples[given:]:
         if not estimator.waiting:
-            break   # the rest of the IMU belongs to no pair
+            break  # the rest of the IMU belongs to no pair
         _add(estimator, sample)
         live += estimator.take()
     return live + estimator.take(end=True)
@@ -168,14 +246,20 @@ def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]
     """IMU samples and stamps of the frames of a bag with their bag times, in bag order."""
     out: list[tuple[int, ImuSample | int]] = []
     for role, message in sensor_messages(bag, topics, (Role.IMU, Role.ACCEL, Role.CAMERA_INFO)):
-        with suppress(InputError):   # the replay counts and reports it
-            out.append((message.bag_time_ns, stamp_ns(message.message.header)
-                        if role is Role.CAMERA_INFO else PARTS[role].read(message.message)))
+        with suppress(InputError):  # the replay counts and reports it
+            out.append(
+                (
+                    message.bag_time_ns,
+                    stamp_ns(message.message.header)
+                    if role is Role.CAMERA_INFO
+                    else PARTS[role].read(message.message),
+                )
+            )
     return out
 
 
 def _add(estimator: OdometryEstimator, sample: ImuSample | int) -> None:
-    with suppress(InputError):   # a stuck gyro: the replay counts and reports it
+    with suppress(InputError):  # a stuck gyro: the replay counts and reports it
         if isinstance(sample, int):
             estimator.add_frame(sample)
         else:
@@ -190,15 +274,16 @@ _SEGMENT = 1.0
 class TrajectoryErrors:
     """Errors of positions after the best rigid alignment, without scale."""
 
-    ate_m: float   # root mean square distance
-    scale_error: float   # of the best similarity, less 1
-    relative_translation_error_percent: float   # median over segments of 1 m
-    length_m: float   # of the true path
+    ate_m: float  # root mean square distance
+    scale_error: float  # of the best similarity, less 1
+    relative_translation_error_percent: float  # median over segments of 1 m
+    length_m: float  # of the true path
 
     def as_json(self) -> dict[str, float | None]:
         """For summary.json, which has no NaN."""
-        return {name: value if math.isfinite(value) else None
-                for name, value in asdict(self).items()}
+        return {
+            name: value if math.isfinite(value) else None for name, value in asdict(self).items()
+        }
 
 
 class ComparedPath(NamedTuple):
@@ -227,8 +312,10 @@ def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> Com
     """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
     covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
     if truth is None or len(covered) < 4:
-        return ComparedPath([pose.imu_ns for pose in trajectory],
-                            np.array([pose.position for pose in trajectory]).reshape(-1, 3))
+        return ComparedPath(
+            [pose.imu_ns for pose in trajectory],
+            np.array([pose.position for pose in trajectory]).reshape(-1, 3),
+        )
     positions = np.array([pose.position for pose in covered])
     true = np.array([truth.position(pose.imu_ns) for pose in covered])
     R, t, scale = aligned(positions, true)
@@ -243,9 +330,17 @@ def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> Com
         if known is not None and covered[j].path == pose.path:
             step = pose.R.T @ (covered[j].position - pose.position)
             relative.append(float(np.linalg.norm(step - known[1])) / float(way[j] - way[i]))
-    return ComparedPath([pose.imu_ns for pose in covered], moved, true, TrajectoryErrors(
-        float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())), scale - 1.0,
-        100.0 * float(np.median(relative)) if relative else math.nan, float(way[-1])))
+    return ComparedPath(
+        [pose.imu_ns for pose in covered],
+        moved,
+        true,
+        TrajectoryErrors(
+            float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())),
+            scale - 1.0,
+            100.0 * float(np.median(relative)) if relative else math.nan,
+            float(way[-1]),
+        ),
+    )
 
 
 def draw_paths(drawn: Mapping[str, ComparedPath], path: Path) -> Figure:
@@ -253,10 +348,14 @@ def draw_paths(drawn: Mapping[str, ComparedPath], path: Path) -> Figure:
     picture = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
     above, height = picture.subplots(1, 2)
     # Live paths begin later: the ground truth of the longer path.
-    lines = [('truth', line.imu_ns, line.truth) for line in sorted(
-        drawn.values(), key=lambda line: -len(line.imu_ns)) if line.truth is not None][:1]
-    lines += [(name, line.imu_ns, line.positions) for name, line in drawn.items()
-              if len(line.imu_ns)]
+    lines = [
+        ('truth', line.imu_ns, line.truth)
+        for line in sorted(drawn.values(), key=lambda line: -len(line.imu_ns))
+        if line.truth is not None
+    ][:1]
+    lines += [
+        (name, line.imu_ns, line.positions) for name, line in drawn.items() if len(line.imu_ns)
+    ]
     first_ns = min((imu_ns[0] for _, imu_ns, _ in lines), default=0)
     for name, imu_ns, positions in lines:
         seconds = [seconds_between(first_ns, at_ns) for at_ns in imu_ns]

@@ -37,44 +37,65 @@ _LONGEST_NS = 100_000_000_000
 class KeyframePair:
     """A keyframe pair as a measurement of two camera poses, at the stamped rows."""
 
-    stamp_ns: int   # of the current image, on the clock of the camera
-    reference_ns: int   # of both images, on the IMU clock
+    stamp_ns: int  # of the current image, on the clock of the camera
+    reference_ns: int  # of both images, on the IMU clock
     current_ns: int
     frame_id: str
     status: str
-    images: ImageInformation | None   # of the images alone; None without information
-    baseline: float   # [m]; NaN if unknown
+    images: ImageInformation | None  # of the images alone; None without information
+    baseline: float  # [m]; NaN if unknown
     baseline_log_sigma: float
-    gyro_bias: Array   # (3,) [rad/s] active, IMU frame; NaN if unknown
-    contradiction: str   # finding against the calibration that ends a path; empty for none
+    gyro_bias: Array  # (3,) [rad/s] active, IMU frame; NaN if unknown
+    contradiction: str  # finding against the calibration that ends a path; empty for none
 
     @classmethod
     def of_result(cls, pair: PairResult) -> KeyframePair:
         """From a pair of the front end."""
         pose = pair.pose
         bias = np.full(3, math.nan) if pair.gyro_bias is None else pair.gyro_bias
-        return cls(pair.stamp_ns, pair.reference_ns1,
-                   pair.reference_ns2, pair.frame_id, pose.status.value, pose.images,
-                   pose.baseline, pose.baseline_log_sigma, bias,
-                   _contradiction(pair.health.state.value, pair.health.text))
+        return cls(
+            pair.stamp_ns,
+            pair.reference_ns1,
+            pair.reference_ns2,
+            pair.frame_id,
+            pose.status.value,
+            pose.images,
+            pose.baseline,
+            pose.baseline_log_sigma,
+            bias,
+            _contradiction(pair.health.state.value, pair.health.text),
+        )
 
     @classmethod
     def of_message(cls, pairs: Any) -> KeyframePair:
         """From a message on ``~/pairs``; InputError if it is unusable."""
         status = PairStatus(pairs)
         if not 0 < status['current_imu_ns'] - status['reference_imu_ns'] < _LONGEST_NS:
-            raise InputError('current_imu_ns of ~/pairs must be later than reference_imu_ns, by '
-                             'less than 100 s: the pair is not used')
-        return cls(stamp_ns(pairs.header), status['reference_imu_ns'], status['current_imu_ns'],
-                   status.frame_id, status['status'], status.images(), status['baseline_m'],
-                   status['baseline_log_sigma'], status['gyro_bias_rad_s'],
-                   _contradiction(status['health'], status['health_findings']))
+            raise InputError(
+                'current_imu_ns of ~/pairs must be later than reference_imu_ns, by '
+                'less than 100 s: the pair is not used'
+            )
+        return cls(
+            stamp_ns(pairs.header),
+            status['reference_imu_ns'],
+            status['current_imu_ns'],
+            status.frame_id,
+            status['status'],
+            status.images(),
+            status['baseline_m'],
+            status['baseline_log_sigma'],
+            status['gyro_bias_rad_s'],
+            _contradiction(status['health'], status['health_findings']),
+        )
 
     def later(self, delay_ns: int) -> KeyframePair:
         """The same for rows that are read `delay_ns` later."""
-        return replace(self, stamp_ns=self.stamp_ns + delay_ns,
-                       reference_ns=self.reference_ns + delay_ns,
-                       current_ns=self.current_ns + delay_ns)
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns + delay_ns,
+            reference_ns=self.reference_ns + delay_ns,
+            current_ns=self.current_ns + delay_ns,
+        )
 
     @property
     def row_ns(self) -> int:
@@ -86,7 +107,8 @@ class KeyframePair:
         if self.images is None or not self.has_direction:
             return self
         ways = self.images.velocities.reshape(2, 3) * seconds_between(
-            self.reference_ns, self.current_ns)
+            self.reference_ns, self.current_ns
+        )
         far = np.linalg.norm(ways - self.images.t, axis=1).max() > _FAR_VELOCITY
         return replace(self, images=self.images.without_velocities()) if far else self
 
@@ -118,8 +140,9 @@ def _contradiction(state: str, findings: str) -> str:
     Pairs continue without the accelerometer, but a path has no other source of scale.
     """
     for finding in findings.split('; '):
-        if finding.startswith(AXES) or \
-                finding.partition(' ')[2].startswith(f'{FindingState.WRONG.value}:'):
+        if finding.startswith(AXES) or finding.partition(' ')[2].startswith(
+            f'{FindingState.WRONG.value}:'
+        ):
             return finding
     return 'the calibration is wrong' if state == FindingState.WRONG.value else ''
 
@@ -144,9 +167,21 @@ def _skew(v: Array) -> Array:
 
 
 @kernel
-def deviations(R1: Array, p1: Array, v1: Array, w1: Array, R2: Array, p2: Array, v2: Array,
-               w2: Array, C: Array, c: Array, R: Array, t: Array,
-               velocities: Array) -> tuple[Array, Array]:
+def deviations(
+    R1: Array,
+    p1: Array,
+    v1: Array,
+    w1: Array,
+    R2: Array,
+    p2: Array,
+    v2: Array,
+    w2: Array,
+    C: Array,
+    c: Array,
+    R: Array,
+    t: Array,
+    velocities: Array,
+) -> tuple[Array, Array]:
     """Deviations (11,) of a measured pair (R, t, velocities), and their derivatives (11, 21).
 
     Of bodies with ``R_k`` to the world, position [m] and velocity [m/s] there, and rate ``w_k``
@@ -179,10 +214,10 @@ def deviations(R1: Array, p1: Array, v1: Array, w1: Array, R2: Array, p2: Array,
         swing = _skew(w_k) @ c
         w = back @ (v_k + R_k @ swing)
         own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
-        e[rows] = w / b - velocities[3 * k:3 * k + 3]
+        e[rows] = w / b - velocities[3 * k : 3 * k + 3]
         by[rows, 0:3] += _skew(w) @ C
-        by[rows, own:own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
-        by[rows, own + 6:own + 9] = back
+        by[rows, own : own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
+        by[rows, own + 6 : own + 9] = back
         by[rows, 18:21] = (C if k == 0 else R12C) @ _skew(w_k)
         by[rows] = (by[rows] - np.outer(w / b, db)) / b
     return e, by

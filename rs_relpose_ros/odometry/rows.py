@@ -41,14 +41,14 @@ _GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])
 class Knot(NamedTuple):
     """A smoothed keyframe."""
 
-    camera_ns: int   # the same time on both clocks
+    camera_ns: int  # the same time on both clocks
     imu_ns: int
-    R: Array   # (3, 3) from the IMU to the world
-    position: Array   # (3,) of the IMU [m]
-    velocity: Array   # (3,) of the IMU in the world [m/s]
+    R: Array  # (3, 3) from the IMU to the world
+    position: Array  # (3,) of the IMU [m]
+    velocity: Array  # (3,) of the IMU in the world [m/s]
     gyro_bias: Array
     accel_bias: Array
-    covariance: Array   # (6, 6) of the base's position and rotation, in the axes of the world
+    covariance: Array  # (6, 6) of the base's position and rotation, in the axes of the world
 
 
 class ArrayFile:
@@ -60,8 +60,9 @@ class ArrayFile:
     def save(self, path: Path | str) -> None:
         """Write an npz file of the attributes, exactly."""
         with written(Path(path), 'wb') as file:
-            np.savez_compressed(file, **{
-                name: getattr(self, name) for name in self.__match_args__})
+            np.savez_compressed(
+                file, **{name: getattr(self, name) for name in self.__match_args__}
+            )
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -72,8 +73,9 @@ class ArrayFile:
         except FileNotFoundError:
             raise InputError(f'{path} does not exist: `rs_relpose odometry` writes it') from None
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f'{path} is damaged or no file of `rs_relpose odometry`: '
-                             f'{error}') from error
+            raise InputError(
+                f'{path} is damaged or no file of `rs_relpose odometry`: {error}'
+            ) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +117,13 @@ class RowTrajectory(ArrayFile):
     loops_ns: Stamps
 
     @classmethod
-    def of_paths(cls, paths: Iterable[Sequence[Knot]], samples: ImuSamples, mounts: Array,
-                 loops_ns: Sequence[tuple[int, int]] = ()) -> RowTrajectory:
+    def of_paths(
+        cls,
+        paths: Iterable[Sequence[Knot]],
+        samples: ImuSamples,
+        mounts: Array,
+        loops_ns: Sequence[tuple[int, int]] = (),
+    ) -> RowTrajectory:
         """From the keyframes of consecutive paths and the samples of the IMU, at least two."""
         spans: list[tuple[int, int]] = []
         knots: list[Knot] = []
@@ -124,25 +131,40 @@ class RowTrajectory(ArrayFile):
         for path in paths:
             # A path that continues one whose end was wrong begins at its end.
             later = [knot for knot in path if not spans or knot.imu_ns >= spans[-1][1]]
-            steps = [(one, two, samples.between(one.imu_ns, two.imu_ns))
-                     for one, two in pairwise(later)]
-            pieces = [_between(one, two, interval) for one, two, interval in steps
-                      if interval is not None]
+            steps = [
+                (one, two, samples.between(one.imu_ns, two.imu_ns)) for one, two in pairwise(later)
+            ]
+            pieces = [
+                _between(one, two, interval)
+                for one, two, interval in steps
+                if interval is not None
+            ]
             if len(pieces) < max(len(steps), 1):
-                continue   # too short, or its samples are not there
+                continue  # too short, or its samples are not there
             spans.append((later[0].imu_ns, later[-1].imu_ns))
             parts += [tuple(column[:-1] for column in piece) for piece in pieces]
             parts.append(tuple(column[-1:] for column in pieces[-1]))
             knots += later
         if not spans:
-            raise InputError('there are no two keyframes with the IMU between them: a trajectory '
-                             'needs an odometry that has started')
+            raise InputError(
+                'there are no two keyframes with the IMU between them: a trajectory '
+                'needs an odometry that has started'
+            )
         stamps, quats, positions, velocities, rates = (
-            np.concatenate(column) for column in zip(*parts, strict=True))
-        return cls(np.array(spans), stamps, quats, positions, velocities, rates,
-                   np.array([(knot.camera_ns, knot.imu_ns) for knot in knots]),
-                   np.array([knot.covariance for knot in knots]), mounts,
-                   np.array(loops_ns, dtype=np.int64).reshape(-1, 2))
+            np.concatenate(column) for column in zip(*parts, strict=True)
+        )
+        return cls(
+            np.array(spans),
+            stamps,
+            quats,
+            positions,
+            velocities,
+            rates,
+            np.array([(knot.camera_ns, knot.imu_ns) for knot in knots]),
+            np.array([knot.covariance for knot in knots]),
+            mounts,
+            np.array(loops_ns, dtype=np.int64).reshape(-1, 2),
+        )
 
     # -- queries ---------------------------------------------------------------------------------
 
@@ -187,10 +209,9 @@ class RowTrajectory(ArrayFile):
 
     def camera_ns(self, t_ns: ArrayLike) -> Stamps:
         """Times on the clock of the camera, as of image stamps."""
-        offsets = np.diff(self.keyframes_ns)[:, 0]   # of the IMU's clock from the camera's
+        offsets = np.diff(self.keyframes_ns)[:, 0]  # of the IMU's clock from the camera's
         times = np.asarray(t_ns)
-        return times - np.rint(np.interp(
-            times, self.keyframes_ns[:, 1], offsets)).astype(np.int64)
+        return times - np.rint(np.interp(times, self.keyframes_ns[:, 1], offsets)).astype(np.int64)
 
     def _at(self, t_ns: ArrayLike, frame: str) -> tuple[Array, Stamps, Array, Array, Array, Array]:
         """Mount, times, R and p of a frame; velocity in the world and rate of the IMU."""
@@ -200,26 +221,39 @@ class RowTrajectory(ArrayFile):
             raise InputError(f't_ns must be integers [ns], got {times.dtype}')
         if not (known := self.covers(times)).all():
             spans = ', '.join(f'{first} to {last}' for first, last in self.spans)
-            raise InputError(f'there is no pose at {int(times[~known].flat[0])} ns: the '
-                             f'trajectory extends from {spans} ns on the clock of the IMU')
-        if not times.size:   # SciPy 1.11 has no empty rotations
+            raise InputError(
+                f'there is no pose at {int(times[~known].flat[0])} ns: the '
+                f'trajectory extends from {spans} ns on the clock of the IMU'
+            )
+        if not times.size:  # SciPy 1.11 has no empty rotations
             nothing = np.zeros((*times.shape, 3))
             return mount, times, np.zeros((*times.shape, 3, 3)), nothing, nothing, nothing
-        k = np.clip(np.searchsorted(self.stamps_ns, times, side='right') - 1, 0,
-                    len(self.stamps_ns) - 2)
+        k = np.clip(
+            np.searchsorted(self.stamps_ns, times, side='right') - 1, 0, len(self.stamps_ns) - 2
+        )
         step = np.maximum(self.stamps_ns[k + 1] - self.stamps_ns[k], 1)[..., None] / NANOSECONDS
         s = (times - self.stamps_ns[k])[..., None] / NANOSECONDS / step
         # Between samples: cubic polynomials with values and derivatives of both.
         first, shape = Rotation.from_quat(self.quats_xyzw[k].reshape(-1, 4)), times.shape
-        turn = (first.inv() * Rotation.from_quat(
-            self.quats_xyzw[k + 1].reshape(-1, 4))).as_rotvec().reshape(*shape, 3)
-        rate1, rate2, v1, v2 = (values[i] for values in (self.rates, self.velocities)
-                                for i in (k, k + 1))
+        turn = (
+            (first.inv() * Rotation.from_quat(self.quats_xyzw[k + 1].reshape(-1, 4)))
+            .as_rotvec()
+            .reshape(*shape, 3)
+        )
+        rate1, rate2, v1, v2 = (
+            values[i] for values in (self.rates, self.velocities) for i in (k, k + 1)
+        )
         turned = _cubic(s, step, turn, rate1, rate2)
         R = (first * Rotation.from_rotvec(turned.reshape(-1, 3))).as_matrix().reshape(*shape, 3, 3)
         p = self.positions[k] + _cubic(s, step, self.positions[k + 1] - self.positions[k], v1, v2)
-        return (mount, times, R @ mount[:, :3], p + R @ mount[:, 3], v1 + s * (v2 - v1),
-                rate1 + s * (rate2 - rate1))
+        return (
+            mount,
+            times,
+            R @ mount[:, :3],
+            p + R @ mount[:, 3],
+            v1 + s * (v2 - v1),
+            rate1 + s * (rate2 - rate1),
+        )
 
 
 def _cubic(s: Array, step: Array, way: Array, slope1: Array, slope2: Array) -> Array:
@@ -233,8 +267,9 @@ def _between(one: Knot, two: Knot, interval: ImuInterval) -> tuple[Any, ...]:
     seconds, rates, forces = interval
     rates, duration = rates - one.gyro_bias, interval.duration
     s = (seconds / duration)[:, None]
-    by_gyro = Rotation.from_matrix(one.R @ integrated_rotations(
-        seconds, np.ascontiguousarray(rates)))
+    by_gyro = Rotation.from_matrix(
+        one.R @ integrated_rotations(seconds, np.ascontiguousarray(rates))
+    )
     error = log_so3(by_gyro[-1].as_matrix().T @ two.R)
     closing = Rotation.from_rotvec(s * error)
     R = by_gyro * closing
@@ -244,30 +279,42 @@ def _between(one: Knot, two: Knot, interval: ImuInterval) -> tuple[Any, ...]:
     position = one.position + at * one.velocity + twice + 0.5 * at**2 * _GRAVITY
     way, change = two.position - position[-1], duration * (two.velocity - velocity[-1])
     position = position + s**2 * (3.0 * way - change + s * (change - 2.0 * way))
-    velocity = velocity + s * (6.0 * way - 2.0 * change
-                               + 3.0 * s * (change - 2.0 * way)) / duration
+    velocity = (
+        velocity + s * (6.0 * way - 2.0 * change + 3.0 * s * (change - 2.0 * way)) / duration
+    )
     stamps = one.imu_ns + np.rint(NANOSECONDS * seconds).astype(np.int64)
     return (stamps, R.as_quat(), position, velocity, closing.inv().apply(rates) + error / duration)
 
 
 # -- files of poses ---------------------------------------------------------------------------
 
+
 class StampedPose(NamedTuple):
     """The camera in the world."""
 
-    stamp_ns: int   # on the clock of the camera
+    stamp_ns: int  # on the clock of the camera
     R: Array
     position: Array
 
 
 def camera_poses(rows: RowTrajectory, rate: float) -> list[StampedPose]:
     """Poses of the camera at a rate [Hz], from the begin of each span; 0: at the keyframes."""
-    times = rows.keyframes_ns[:, 1] if not rate else np.concatenate([
-        first + np.rint(np.arange(0.0, last - first + 1.0, NANOSECONDS / rate)).astype(np.int64)
-        for first, last in rows.spans])
+    times = (
+        rows.keyframes_ns[:, 1]
+        if not rate
+        else np.concatenate(
+            [
+                first
+                + np.rint(np.arange(0.0, last - first + 1.0, NANOSECONDS / rate)).astype(np.int64)
+                for first, last in rows.spans
+            ]
+        )
+    )
     times = times[rows.covers(times)]
-    return [StampedPose(int(stamp_ns), *pose) for stamp_ns, *pose in zip(
-        rows.camera_ns(times), *rows.pose(times), strict=True)]
+    return [
+        StampedPose(int(stamp_ns), *pose)
+        for stamp_ns, *pose in zip(rows.camera_ns(times), *rows.pose(times), strict=True)
+    ]
 
 
 def write_tum(path: Path, trajectory: Sequence[Odometry | StampedPose]) -> None:
@@ -275,5 +322,8 @@ def write_tum(path: Path, trajectory: Sequence[Odometry | StampedPose]) -> None:
     with written(path) as file:
         for pose in trajectory:
             values = [*pose.position, *quat_xyzw(pose.R)]
-            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
-                       + ' '.join(f'{value:.9f}' for value in values) + '\n')
+            file.write(
+                f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
+                + ' '.join(f'{value:.9f}' for value in values)
+                + '\n'
+            )

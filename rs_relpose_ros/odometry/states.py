@@ -29,8 +29,8 @@ class OdometryState(str, Enum):
 
     STARTING = 'starting'
     TRACKING = 'tracking'
-    UNCERTAIN = 'uncertain'   # on the IMU alone
-    LOST = 'lost'   # until the next start
+    UNCERTAIN = 'uncertain'  # on the IMU alone
+    LOST = 'lost'  # until the next start
 
 
 class StateInterval(NamedTuple):
@@ -45,15 +45,18 @@ class StateInterval(NamedTuple):
 class Base(NamedTuple):
     """The frame that is published, with the camera on it: ``X_base = R X_cam + position``."""
 
-    frame_id: str = ''   # empty: the camera itself
+    frame_id: str = ''  # empty: the camera itself
     R: Array = np.eye(3)
-    position: Array = np.zeros(3)   # of the camera [m]
+    position: Array = np.zeros(3)  # of the camera [m]
 
     @classmethod
     def of(cls, frame_id: str, base_to_camera: Sequence[float]) -> Base:
         """From x y z, quaternion x y z w of the camera in the base."""
-        return cls(frame_id, Rotation.from_quat(base_to_camera[3:]).as_matrix(),
-                   np.array(base_to_camera[:3]))
+        return cls(
+            frame_id,
+            Rotation.from_quat(base_to_camera[3:]).as_matrix(),
+            np.array(base_to_camera[:3]),
+        )
 
     def camera(self, pose: Odometry) -> Odometry:
         """The pose of the camera instead of that of the base; the rest is unchanged."""
@@ -64,17 +67,17 @@ class Base(NamedTuple):
 class Odometry:
     """The base, or without one the camera, in a metric world with z up, at a time."""
 
-    stamp_ns: int   # on the camera's clock, as image stamps
-    imu_ns: int   # the same time on the IMU clock
-    frame_id: str   # of the base
-    path: int   # number of earlier starts in the same world
-    corrections: int   # of the keyframe from which it is propagated, since the first start
-    R: Array   # (3, 3) from the base
-    position: Array   # (3,) [m]
-    pose_covariance: Array   # (6, 6) of (position, rotation), in the axes of the world
-    velocity: Array   # (3,) of the base, in its axes [m/s]
-    angular_velocity: Array   # (3,) likewise [rad/s]
-    velocity_covariance: Array   # (6, 6) of the two
+    stamp_ns: int  # on the camera's clock, as image stamps
+    imu_ns: int  # the same time on the IMU clock
+    frame_id: str  # of the base
+    path: int  # number of earlier starts in the same world
+    corrections: int  # of the keyframe from which it is propagated, since the first start
+    R: Array  # (3, 3) from the base
+    position: Array  # (3,) [m]
+    pose_covariance: Array  # (6, 6) of (position, rotation), in the axes of the world
+    velocity: Array  # (3,) of the base, in its axes [m/s]
+    angular_velocity: Array  # (3,) likewise [rad/s]
+    velocity_covariance: Array  # (6, 6) of the two
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +86,8 @@ class StartReport:
 
     at_rest: bool
     imu_ns: int
-    seconds: float   # since its first pair
-    scale_sigma: float   # relative
+    seconds: float  # since its first pair
+    scale_sigma: float  # relative
 
 
 class ContinuousPath:
@@ -95,7 +98,7 @@ class ContinuousPath:
 
     def __init__(self, propagated: Callable[[int], Odometry | None]) -> None:
         self._propagated = propagated
-        self._offset = np.zeros(6)   # position, rotation; in the world
+        self._offset = np.zeros(6)  # position, rotation; in the world
         self.reset()
 
     def reset(self) -> None:
@@ -116,16 +119,20 @@ class ContinuousPath:
             seconds = seconds_between(last.imu_ns, imu_ns)
             if state.corrections != last.corrections:
                 before = self._propagated(last.imu_ns)
-                if before is None:   # the newest keyframe is later: back at the mean velocity
+                if before is None:  # the newest keyframe is later: back at the mean velocity
                     way = 0.5 * seconds * (last.R @ last.velocity + state.R @ state.velocity)
                     turn = 0.5 * seconds * (last.angular_velocity + state.angular_velocity)
-                    before = replace(state, position=state.position - way,
-                                     R=state.R @ exp_so3(-turn))
-                self._offset = np.concatenate([
-                    last.position - before.position, log_so3(last.R @ before.R.T)])
+                    before = replace(
+                        state, position=state.position - way, R=state.R @ exp_so3(-turn)
+                    )
+                self._offset = np.concatenate(
+                    [last.position - before.position, log_so3(last.R @ before.R.T)]
+                )
             self._offset = self._offset * math.exp(-seconds / _BLENDING)
         self._last = replace(
-            state, position=state.position + self._offset[:3],
+            state,
+            position=state.position + self._offset[:3],
             R=exp_so3(self._offset[3:]) @ state.R,
-            pose_covariance=state.pose_covariance + np.outer(self._offset, self._offset))
+            pose_covariance=state.pose_covariance + np.outer(self._offset, self._offset),
+        )
         return self._last

@@ -63,16 +63,27 @@ class CheckReport:
         for finding in self.findings:
             head = f'{finding.state.verdict:<8} {finding.quantity:<{names}}  '
             text = finding.message + (f' -> {finding.fix}' if finding.fix else '')
-            lines += textwrap.wrap(text, width, initial_indent=head,
-                                   subsequent_indent=' ' * len(head), break_on_hyphens=False)
+            lines += textwrap.wrap(
+                text,
+                width,
+                initial_indent=head,
+                subsequent_indent=' ' * len(head),
+                break_on_hyphens=False,
+            )
         counts = Counter(finding.state for finding in self.findings)
-        return [*lines, f'{self.bag}: ' + ', '.join(
-            f'{counts[state]} {state.verdict}' for state in FindingState)]
+        return [
+            *lines,
+            f'{self.bag}: '
+            + ', '.join(f'{counts[state]} {state.verdict}' for state in FindingState),
+        ]
 
     def to_mapping(self) -> dict[str, Any]:
         """The report as data for JSON."""
-        return {'bag': self.bag, 'failed': self.failed,
-                'findings': [finding.as_check_json() for finding in self.findings]}
+        return {
+            'bag': self.bag,
+            'failed': self.failed,
+            'findings': [finding.as_check_json() for finding in self.findings],
+        }
 
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
@@ -91,24 +102,35 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
         completion = check_recording.completed(bag, topics, parameters)
         if not completion.parameters.sensor.missing():
             sample = check_recording.sampled(source, images, completion.parameters)
-    for _ in source:   # all of it without a sample
+    for _ in source:  # all of it without a sample
         pass
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if contradiction:
-        findings.append(Finding('transforms', SUSPECT, contradiction, 'correct the description of '
-                                'the robot (URDF), or the parameter', measured={}))
+        findings.append(
+            Finding(
+                'transforms',
+                SUSPECT,
+                contradiction,
+                'correct the description of the robot (URDF), or the parameter',
+                measured={},
+            )
+        )
     if chosen.image is not None:
         findings += [
-            *_encoding(scan, chosen.image, parameters), _rate(scan.stamps(Role.IMAGE)),
+            *_encoding(scan, chosen.image, parameters),
+            _rate(scan.stamps(Role.IMAGE)),
             stamp_finding('image stamps', scan.stamps(Role.IMAGE), 'the camera'),
-            _calibration(scan), _transport(scan, chosen.image, bag.reliability(chosen.image))]
+            _calibration(scan),
+            _transport(scan, chosen.image, bag.reliability(chosen.image)),
+        ]
     if chosen.imu is not None:
         findings += _imu(scan, bag.reliability(chosen.imu), parameters)
     if topics is not None:
         if sample is not None and sample.is_lost and completion.found is None:
-            with suppress(InputError):   # the recording permits no calibration
-                completion = completion._replace(found=check_recording.calibrated(
-                    bag, topics, completion.parameters))
+            with suppress(InputError):  # the recording permits no calibration
+                completion = completion._replace(
+                    found=check_recording.calibrated(bag, topics, completion.parameters)
+                )
         findings += joint_findings(scan, sample, completion, parameters)
     return CheckReport(str(bag.path), tuple(findings))
 
@@ -118,24 +140,40 @@ def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Finding:
     needed = ['image', 'imu'] if parameters.intrinsics.given else ['image', 'camera_info', 'imu']
     absent = [role for role in needed if measured[role] is None]
     if not absent:
-        return by_case('topics', ', '.join(f'{topic.name} ({topic.count})'
-                                           for topic in filter(None, chosen)), measured)
+        return by_case(
+            'topics',
+            ', '.join(f'{topic.name} ({topic.count})' for topic in filter(None, chosen)),
+            measured,
+        )
     there = ', '.join(map(str, bag.topics)) or 'no topics at all'
-    return Finding('topics', WRONG, f'no {" and no ".join(absent)} topic; the bag has {there}',
-                   'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu '
-                   'with gyro', measured=measured)
+    return Finding(
+        'topics',
+        WRONG,
+        f'no {" and no ".join(absent)} topic; the bag has {there}',
+        'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu with gyro',
+        measured=measured,
+    )
 
 
 def _parameters(parameters: Parameters) -> Finding:
     sensor, missing = parameters.sensor, parameters.sensor.missing()
     if missing:
-        return Finding('parameters', SUSPECT, f'{" and ".join(missing)} not configured',
-                       'the node needs them: add --params FILE, or estimate them from a recording '
-                       'with "rs_relpose calibrate"', measured={'missing': missing})
+        return Finding(
+            'parameters',
+            SUSPECT,
+            f'{" and ".join(missing)} not configured',
+            'the node needs them: add --params FILE, or estimate them from a recording '
+            'with "rs_relpose calibrate"',
+            measured={'missing': missing},
+        )
     nearest = axes_text(observations.nearest_axis_map(sensor.R_cam_imu))
-    return by_case('parameters', f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, '
-                   f'time_offset {1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about '
-                   f'{nearest})', {'missing': [], 'nearest': nearest})
+    return by_case(
+        'parameters',
+        f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, '
+        f'time_offset {1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about '
+        f'{nearest})',
+        {'missing': [], 'nearest': nearest},
+    )
 
 
 # -- Images and their calibration -------------------------------------------------------------
@@ -150,8 +188,13 @@ _MOST_STAMPS = 1000
 
 
 def _no_step(name: str, stamps: Stamps, measured: dict[str, Any]) -> Finding:
-    return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
-                   'record longer, and correct the stamps of the driver', measured=measured)
+    return Finding(
+        name,
+        WRONG,
+        f'{stamps.count} message(s), no two of increasing stamps',
+        'record longer, and correct the stamps of the driver',
+        measured=measured,
+    )
 
 
 def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
@@ -161,60 +204,115 @@ def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
         varying = frame_times(first_ns).varying if len(first_ns) > 2 else Varying.UNCLEAR
     repeated, backwards = int((stamps.steps == 0.0).sum()), int((stamps.steps < 0.0).sum())
     jitter, furthest_back = stamps.jitter, abs(float(stamps.steps.min(initial=0.0)))
-    measured = {'jitter_s': jitter, 'repeated': repeated, 'backwards': backwards,
-                'furthest_back_s': furthest_back,
-                'delay_s': stamps.delay if stamps.count else None}
+    measured = {
+        'jitter_s': jitter,
+        'repeated': repeated,
+        'backwards': backwards,
+        'furthest_back_s': furthest_back,
+        'delay_s': stamps.delay if stamps.count else None,
+    }
     if not stamps.interval > 0.0:
         return _no_step(name, stamps, measured)
     text, unordered = f'jitter {1e3 * jitter:.2f} ms', repeated + backwards
     if unordered:
-        text += (f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} '
-                 's)')
+        text += f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} s)'
     return by_case(
-        name, text, measured,
-        Case(unordered > 0.2 * stamps.count, WRONG,
-             f'have the driver of {of} stamp each message with its own time'),
-        Case(furthest_back > 1.0, SUSPECT, 'the clock was set back or the bag has two '
-             'recordings: the node restarts there; record with a steady clock'),
-        Case(unordered > 0, SUSPECT,
-             'these messages are not used: look for two publishers on the topic'),
+        name,
+        text,
+        measured,
+        Case(
+            unordered > 0.2 * stamps.count,
+            WRONG,
+            f'have the driver of {of} stamp each message with its own time',
+        ),
+        Case(
+            furthest_back > 1.0,
+            SUSPECT,
+            'the clock was set back or the bag has two '
+            'recordings: the node restarts there; record with a steady clock',
+        ),
+        Case(
+            unordered > 0,
+            SUSPECT,
+            'these messages are not used: look for two publishers on the topic',
+        ),
         Case(jitter <= max(0.2 * stamps.interval, 1e-3), OK),
-        Case(varying is Varying.EXPOSURE, OK, 'the time offset follows it: estimate '
-             'time_offset_per_interval with "rs_relpose calibrate", or fix the exposure',
-             ', over many frames each, as by automatic exposure'),
-        Case(varying is Varying.JITTER, SUSPECT, 'probably times of arrival: have '
-             f'{of} stamp in hardware, or at the interrupt'),
-        Case(True, SUSPECT, f'verify the stamps of {of}',
-             ', neither as by times of arrival nor as by automatic exposure'))
+        Case(
+            varying is Varying.EXPOSURE,
+            OK,
+            'the time offset follows it: estimate '
+            'time_offset_per_interval with "rs_relpose calibrate", or fix the exposure',
+            ', over many frames each, as by automatic exposure',
+        ),
+        Case(
+            varying is Varying.JITTER,
+            SUSPECT,
+            f'probably times of arrival: have {of} stamp in hardware, or at the interrupt',
+        ),
+        Case(
+            True,
+            SUSPECT,
+            f'verify the stamps of {of}',
+            ', neither as by times of arrival nor as by automatic exposure',
+        ),
+    )
 
 
 def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Finding]:
     sizes = ', '.join(f'{width}x{height}' for width, height in scan.sizes)
     found = by_case(
-        'images', f'{sizes} {", ".join(scan.encodings)}'.strip(),
-        {'encodings': dict(scan.encodings), 'bad_images': scan.unusable[Role.IMAGE],
-         'sizes': [list(size) for size in scan.sizes]},
-        Case(scan.unusable[Role.IMAGE] > 0, SUSPECT if scan.sizes else WRONG,
-             'publish original images of a known encoding, or JPEG or PNG',
-             f'; {scan.unusable[Role.IMAGE]} cannot be used: {scan.problems.get(Role.IMAGE)}'),
-        Case('image_rect' in topic.name, WRONG, 'record the original (raw) images: rectified rows '
-             'have no common time', f'; {topic.name} is rectified'),
-        Case(len(scan.sizes) > 1, SUSPECT,
-             'keep the resolution; the readout time changes with it', ': the size changes'))
+        'images',
+        f'{sizes} {", ".join(scan.encodings)}'.strip(),
+        {
+            'encodings': dict(scan.encodings),
+            'bad_images': scan.unusable[Role.IMAGE],
+            'sizes': [list(size) for size in scan.sizes],
+        },
+        Case(
+            scan.unusable[Role.IMAGE] > 0,
+            SUSPECT if scan.sizes else WRONG,
+            'publish original images of a known encoding, or JPEG or PNG',
+            f'; {scan.unusable[Role.IMAGE]} cannot be used: {scan.problems.get(Role.IMAGE)}',
+        ),
+        Case(
+            'image_rect' in topic.name,
+            WRONG,
+            'record the original (raw) images: rectified rows have no common time',
+            f'; {topic.name} is rectified',
+        ),
+        Case(
+            len(scan.sizes) > 1,
+            SUSPECT,
+            'keep the resolution; the readout time changes with it',
+            ': the size changes',
+        ),
+    )
     compressed = topic.msgtype == reader.COMPRESSED_IMAGE
     if compressed == (parameters.pair.image_transport == 'compressed'):
         return [found]
     right = 'compressed' if compressed else 'raw'
-    return [found, Finding('transport', SUSPECT, f'the images are {right}',
-                           f'set image_transport: {right} for the live node (replay detects it)',
-                           measured={'image_transport': right})]
+    return [
+        found,
+        Finding(
+            'transport',
+            SUSPECT,
+            f'the images are {right}',
+            f'set image_transport: {right} for the live node (replay detects it)',
+            measured={'image_transport': right},
+        ),
+    ]
 
 
 def _rate(stamps: Stamps) -> Finding:
     name, interval, duration = 'image rate', stamps.interval, stamps.duration
     if not interval > 0.0:
-        return Finding(name, WRONG, f'{stamps.count} image(s) of different stamps or fewer',
-                       'record at least some seconds', measured={'count': stamps.count})
+        return Finding(
+            name,
+            WRONG,
+            f'{stamps.count} image(s) of different stamps or fewer',
+            'record at least some seconds',
+            measured={'count': stamps.count},
+        )
     # Each longer step hides frames; 1.5 of a step occurs even with automatic exposure.
     gaps, longest = int((stamps.forwards > 1.7 * interval).sum()), stamps.longest
     missed = max(round(duration / interval) - stamps.count + 1, 0) if gaps else 0
@@ -222,52 +320,96 @@ def _rate(stamps: Stamps) -> Finding:
     if gaps:
         text += f', about {missed} missed in {gaps} gaps, the longest {longest:.2f} s'
     return by_case(
-        name, text, {'rate_hz': 1.0 / interval, 'count': stamps.count, 'duration_s': duration,
-                     'gaps': gaps, 'longest_step_s': longest, 'missed': missed},
-        Case(1.0 / interval < _SLOW, SUSPECT, f'record at {_SLOW:g} Hz or more: points are lost '
-             'between frames that are far apart'),
-        Case(missed > _MISSED_SHARE * stamps.count, SUSPECT, 'images are lost in transport: use '
-             'config/fastdds.xml, compressed images, or a faster disk'))
+        name,
+        text,
+        {
+            'rate_hz': 1.0 / interval,
+            'count': stamps.count,
+            'duration_s': duration,
+            'gaps': gaps,
+            'longest_step_s': longest,
+            'missed': missed,
+        },
+        Case(
+            1.0 / interval < _SLOW,
+            SUSPECT,
+            f'record at {_SLOW:g} Hz or more: points are lost between frames that are far apart',
+        ),
+        Case(
+            missed > _MISSED_SHARE * stamps.count,
+            SUSPECT,
+            'images are lost in transport: use '
+            'config/fastdds.xml, compressed images, or a faster disk',
+        ),
+    )
 
 
 def _calibration(scan: Scan) -> Finding:
     name, intrinsics = 'calibration', scan.intrinsics
     if intrinsics is None:
-        return Finding(name, WRONG, scan.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
-                       'calibrate the camera (camera_calibration, OpenCV) and have its driver '
-                       'publish the CameraInfo, or set camera_matrix: "rs_relpose calibrate" '
-                       'estimates its focal length', measured={})
+        return Finding(
+            name,
+            WRONG,
+            scan.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
+            'calibrate the camera (camera_calibration, OpenCV) and have its driver '
+            'publish the CameraInfo, or set camera_matrix: "rs_relpose calibrate" '
+            'estimates its focal length',
+            measured={},
+        )
     size = intrinsics.image_width, intrinsics.image_height
     other = next(iter(scan.sizes), size) if size not in scan.sizes else size
     straight = intrinsics.global_shutter_camera().is_undistorted
-    wide = intrinsics.width > 2.0 * intrinsics.fx   # more than 90 deg
+    wide = intrinsics.width > 2.0 * intrinsics.fx  # more than 90 deg
     return by_case(
-        name, f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
+        name,
+        f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
         f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}'
         + (' by camera_matrix' if scan.configured.given else ''),
-        {'fx': intrinsics.fx, 'fy': intrinsics.fy,
-         'distortion_model': intrinsics.distortion_model, 'different': scan.calibrations},
-        Case(other != size, WRONG, 'publish the CameraInfo of this resolution, region of interest '
-             'and binning included', f': for images of {size[0]}x{size[1]}, but they are '
-             f'{other[0]}x{other[1]}'),
-        Case(straight and wide, SUSPECT, 'correct for a simulated or a rectifying camera only: '
-             'otherwise calibrate it', ' without distortion'),
+        {
+            'fx': intrinsics.fx,
+            'fy': intrinsics.fy,
+            'distortion_model': intrinsics.distortion_model,
+            'different': scan.calibrations,
+        },
+        Case(
+            other != size,
+            WRONG,
+            'publish the CameraInfo of this resolution, region of interest and binning included',
+            f': for images of {size[0]}x{size[1]}, but they are {other[0]}x{other[1]}',
+        ),
+        Case(
+            straight and wide,
+            SUSPECT,
+            'correct for a simulated or a rectifying camera only: otherwise calibrate it',
+            ' without distortion',
+        ),
         Case(straight, OK, '', ' without distortion'),
-        Case(scan.calibrations > 1, SUSPECT, 'keep zoom and focus: each change restarts tracks',
-             f'; it changes {scan.calibrations - 1} times'))
+        Case(
+            scan.calibrations > 1,
+            SUSPECT,
+            'keep zoom and focus: each change restarts tracks',
+            f'; it changes {scan.calibrations - 1} times',
+        ),
+    )
 
 
 def _transport(scan: Scan, topic: Topic, reliability: str) -> Finding:
     size = scan.largest_image
     offered = f'recorded as {reliability}' if reliability else 'reliability not recorded'
     return by_case(
-        'live transport', f'{topic.name} {offered}, up to {size / 1e3:.0f} kB per image',
+        'live transport',
+        f'{topic.name} {offered}, up to {size / 1e3:.0f} kB per image',
         {'largest_bytes': size, 'reliability': reliability or None},
-        Case(size > _LARGE_MESSAGE, SUSPECT, 'live, Fast DDS loses most images above 512 KiB with '
-             'its default transports: start driver and node with '
-             'FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml, or use image_transport: '
-             'compressed'),
-        Case(True, OK, '', '; the node subscribes best effort, which matches both'))
+        Case(
+            size > _LARGE_MESSAGE,
+            SUSPECT,
+            'live, Fast DDS loses most images above 512 KiB with '
+            'its default transports: start driver and node with '
+            'FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml, or use image_transport: '
+            'compressed',
+        ),
+        Case(True, OK, '', '; the node subscribes best effort, which matches both'),
+    )
 
 
 # -- Gyro and accelerometer -------------------------------------------------------------------
@@ -283,80 +425,151 @@ def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
     """Findings on the IMU by itself."""
     if not len(scan.rates):
         problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
-        return [Finding('gyro', WRONG, f'no gyro: {problem}', 'choose a topic that has '
-                        'angular_velocity with --imu-topic', measured={})]
+        return [
+            Finding(
+                'gyro',
+                WRONG,
+                f'no gyro: {problem}',
+                'choose a topic that has angular_velocity with --imu-topic',
+                measured={},
+            )
+        ]
     stamps, gap = scan.stamps(Role.IMU), parameters.imu.max_imu_gap
     rate = _no_step('imu rate', stamps, {})
     if stamps.interval > 0.0:
         gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
         hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
         rate = by_case(
-            'imu rate', f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
+            'imu rate',
+            f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
             f'{1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability),
-            {'rate_hz': hertz, 'count': stamps.count, 'gaps': gaps, 'longest_step_s': longest,
-             'unusable': unusable, 'reliability': reliability or None},
-            Case(stamps.interval > gap, WRONG, f'steps longer than max_imu_gap = {gap:g} s are '
-                 'not interpolated: raise the rate to 100 Hz or more'),
-            Case(unusable > 0, SUSPECT, 'correct the driver',
-                 f'; {unusable} messages cannot be used: {scan.problems.get(Role.IMU)}'),
-            Case(gaps > 0, SUSPECT, "frames in a gap are refused: give the IMU's subscription a "
-                 'deeper queue, or record on the machine of the driver',
-                 f'; {gaps} gaps above {1e3 * gap:.0f} ms'),
-            Case(hertz < _SLOW_IMU, SUSPECT, 'publish 200 Hz or more, which resolves the rotation '
-                 'of a hand within one readout'))
-    return [rate, stamp_finding('imu stamps', stamps, 'the IMU'), _gyro(scan),
-            _bias(scan, parameters), _accelerometer(scan)]
+            {
+                'rate_hz': hertz,
+                'count': stamps.count,
+                'gaps': gaps,
+                'longest_step_s': longest,
+                'unusable': unusable,
+                'reliability': reliability or None,
+            },
+            Case(
+                stamps.interval > gap,
+                WRONG,
+                f'steps longer than max_imu_gap = {gap:g} s are '
+                'not interpolated: raise the rate to 100 Hz or more',
+            ),
+            Case(
+                unusable > 0,
+                SUSPECT,
+                'correct the driver',
+                f'; {unusable} messages cannot be used: {scan.problems.get(Role.IMU)}',
+            ),
+            Case(
+                gaps > 0,
+                SUSPECT,
+                "frames in a gap are refused: give the IMU's subscription a "
+                'deeper queue, or record on the machine of the driver',
+                f'; {gaps} gaps above {1e3 * gap:.0f} ms',
+            ),
+            Case(
+                hertz < _SLOW_IMU,
+                SUSPECT,
+                'publish 200 Hz or more, which resolves the rotation of a hand within one readout',
+            ),
+        )
+    return [
+        rate,
+        stamp_finding('imu stamps', stamps, 'the IMU'),
+        _gyro(scan),
+        _bias(scan, parameters),
+        _accelerometer(scan),
+    ]
 
 
 def _gyro(scan: Scan) -> Finding:
     rates = np.linalg.norm(scan.rates, axis=1)
     median, high = float(np.median(rates)), float(np.percentile(rates, 95))
     return by_case(
-        'gyro', f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
+        'gyro',
+        f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
         {'median_rad_s': median, 'p95_rad_s': high},
-        Case(float(np.ptp(scan.rates, axis=0).max()) == 0.0, WRONG,
-             'the sensor is stuck or not read: correct its driver', '; all samples are equal'),
-        Case(median > _FASTEST_MEDIAN, WRONG, 'these are degrees per second: sensor_msgs/Imu '
-             'requires rad/s, so correct the driver', f' if {median:.0f} were rad/s'))
+        Case(
+            float(np.ptp(scan.rates, axis=0).max()) == 0.0,
+            WRONG,
+            'the sensor is stuck or not read: correct its driver',
+            '; all samples are equal',
+        ),
+        Case(
+            median > _FASTEST_MEDIAN,
+            WRONG,
+            'these are degrees per second: sensor_msgs/Imu requires rad/s, so correct the driver',
+            f' if {median:.0f} were rad/s',
+        ),
+    )
 
 
 def _bias(scan: Scan, parameters: Parameters) -> Finding:
     configured, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
     name, rest = 'gyro at rest', scan.rest
     if rest is None:
-        return Finding(name, UNKNOWN, 'not measured: the IMU is never at rest here',
-                       'to measure it, keep the camera at rest for some seconds',
-                       measured={'at_rest_rad_s': None})
+        return Finding(
+            name,
+            UNKNOWN,
+            'not measured: the IMU is never at rest here',
+            'to measure it, keep the camera at rest for some seconds',
+            measured={'at_rest_rad_s': None},
+        )
     listed = [round(float(value), 5) for value in rest.value]
     off = float(np.abs(rest.value - np.array(configured)).max())
     return by_case(
-        name, f'mean at rest {listed} rad/s (+- {rest.sigma:.4f})',
+        name,
+        f'mean at rest {listed} rad/s (+- {rest.sigma:.4f})',
         {'at_rest_rad_s': listed, 'sigma_rad_s': rest.sigma},
-        Case(off > 4.0 * math.hypot(sigma, rest.sigma), SUSPECT, f'set gyro_bias: {listed} if the '
-             'camera was at rest there (a slow constant rate is similar)',
-             f', gyro_bias is {list(np.array(configured))} +- {sigma:g}'))
+        Case(
+            off > 4.0 * math.hypot(sigma, rest.sigma),
+            SUSPECT,
+            f'set gyro_bias: {listed} if the '
+            'camera was at rest there (a slow constant rate is similar)',
+            f', gyro_bias is {list(np.array(configured))} +- {sigma:g}',
+        ),
+    )
 
 
 def _accelerometer(scan: Scan) -> Finding:
     name, forces = 'gravity', scan.forces
     if not len(forces):
         return by_case(
-            name, 'no accelerometer', {'mean_length_m_s2': None,
-                                       'orientations': scan.orientations},
+            name,
+            'no accelerometer',
+            {'mean_length_m_s2': None, 'orientations': scan.orientations},
             Case(scan.orientations > 0, OK, '', ', but an orientation'),
-            Case(True, SUSPECT, "poses are less accurate without: choose the accelerometer's "
-                 'topic with --accel-topic (node: remap accel)'))
+            Case(
+                True,
+                SUSPECT,
+                "poses are less accurate without: choose the accelerometer's "
+                'topic with --accel-topic (node: remap accel)',
+            ),
+        )
     length = float(np.linalg.norm(forces, axis=1).mean())
     fault = length_fault(length)
     text = fault.partition(': ')[0] or f'|acc| {length:.2f} m/s^2 in the mean'
     if scan.orientations:
         text += f', and {scan.orientations} orientations with covariance'
     return by_case(
-        name, text, {'mean_length_m_s2': length, 'mean_m_s2': forces.mean(axis=0).tolist(),
-                     'orientations': scan.orientations},
+        name,
+        text,
+        {
+            'mean_length_m_s2': length,
+            'mean_m_s2': forces.mean(axis=0).tolist(),
+            'orientations': scan.orientations,
+        },
         Case(bool(fault), WRONG, f'{fault.partition(": ")[2]}; or set use_gravity: false'),
-        Case(not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1], SUSPECT, 'calibrate the '
-             'accelerometer (bias, scale), or set use_gravity: false', ', not near 9.81'))
+        Case(
+            not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1],
+            SUSPECT,
+            'calibrate the accelerometer (bias, scale), or set use_gravity: false',
+            ', not near 9.81',
+        ),
+    )
 
 
 # -- Images and gyro together -----------------------------------------------------------------
@@ -378,8 +591,9 @@ _READOUT = frozenset(('readout_time', 'readout_direction'))
 _SET_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
 
 
-def joint_findings(scan: Scan, sample: Sample | None, completion: Completion,
-                   parameters: Parameters) -> list[Finding]:
+def joint_findings(
+    scan: Scan, sample: Sample | None, completion: Completion, parameters: Parameters
+) -> list[Finding]:
     """Findings on both sensors together.
 
     `sample` is None if `completion` could not find missing `parameters`.
@@ -391,8 +605,9 @@ def joint_findings(scan: Scan, sample: Sample | None, completion: Completion,
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
     found += [_not_configured(name, completion, scan) for name in sorted(missing)]
-    found += [finding for finding in quantity_findings(health, reason)
-              if finding.quantity not in missing]
+    found += [
+        finding for finding in quantity_findings(health, reason) if finding.quantity not in missing
+    ]
     effect = _effect(scan, health, completion.parameters)
     return found if effect is None else [*found, effect]
 
@@ -401,41 +616,70 @@ def _overlap(scan: Scan, parameters: Parameters) -> Finding:
     """Whether the gyro covers the images in time, as stamped."""
     name, images, imu = 'clocks', scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
     if not images.count or not imu.count:
-        return Finding(name, WRONG, 'no stamps to compare', 'correct the topics above',
-                       measured={})
+        return Finding(
+            name, WRONG, 'no stamps to compare', 'correct the topics above', measured={}
+        )
     image_ns, imu_ns = images.ns + round(parameters.sensor.time_offset * 1e9), imu.ns
     common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
     apart = images.delay - imu.delay
     measured = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
     if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
-            _SAME_CLOCK, 0.5 * images.duration):
-        return Finding(name, WRONG, f'images and IMU are stamped {abs(apart):.3f} s apart',
-                       'use one clock for both drivers (ROS time, not time since boot), or set '
-                       f'time_offset: {apart:.3f} if the difference is constant',
-                       measured=measured)
+        _SAME_CLOCK, 0.5 * images.duration
+    ):
+        return Finding(
+            name,
+            WRONG,
+            f'images and IMU are stamped {abs(apart):.3f} s apart',
+            'use one clock for both drivers (ROS time, not time since boot), or set '
+            f'time_offset: {apart:.3f} if the difference is constant',
+            measured=measured,
+        )
     return by_case(
-        name, f'{common:.1f} s in common; recorded {1e3 * images.delay:.0f} ms (images) and '
-        f'{1e3 * imu.delay:.0f} ms (IMU) after their stamps', measured,
-        Case(common < 0.8 * images.duration, SUSPECT, "images outside of the IMU's time are "
-             'refused: start the IMU first and stop it last'),
-        Case(abs(apart) > _SAME_CLOCK, SUSPECT,
-             'the delays differ: verify that both stamp the time of measurement'))
+        name,
+        f'{common:.1f} s in common; recorded {1e3 * images.delay:.0f} ms (images) and '
+        f'{1e3 * imu.delay:.0f} ms (IMU) after their stamps',
+        measured,
+        Case(
+            common < 0.8 * images.duration,
+            SUSPECT,
+            "images outside of the IMU's time are refused: start the IMU first and stop it last",
+        ),
+        Case(
+            abs(apart) > _SAME_CLOCK,
+            SUSPECT,
+            'the delays differ: verify that both stamp the time of measurement',
+        ),
+    )
 
 
 def _pairs(sample: Sample, health: Assessment) -> Finding:
     pairs, posed = len(sample.matches), sample.poses
     reason = next(iter(sample.reasons.most_common()), 'too few images were processed')
     return by_case(
-        'pairs', f'{pairs} pairs in {sample.frames} images, {posed} with a pose',
+        'pairs',
+        f'{pairs} pairs in {sample.frames} images, {posed} with a pose',
         {'images': sample.frames, 'pairs': pairs, 'poses': posed},
-        Case(sample.is_refused, WRONG, 'hardly any image can be used: correct the reason',
-             f': {reason}'),
+        Case(
+            sample.is_refused,
+            WRONG,
+            'hardly any image can be used: correct the reason',
+            f': {reason}',
+        ),
         Case(not posed, UNKNOWN, '', f': {reason}'),
-        Case(sample.few_poses and health.state is WRONG, SUSPECT,
-             'correct the parameters that are wrong, below', f'; without: {reason}'),
-        Case(sample.few_poses, SUSPECT, 'translate the camera more; if it does move, a '
-             'parameter is too far off to be observable: measure all with "rs_relpose calibrate"',
-             f'; without: {reason}'))
+        Case(
+            sample.few_poses and health.state is WRONG,
+            SUSPECT,
+            'correct the parameters that are wrong, below',
+            f'; without: {reason}',
+        ),
+        Case(
+            sample.few_poses,
+            SUSPECT,
+            'translate the camera more; if it does move, a '
+            'parameter is too far off to be observable: measure all with "rs_relpose calibrate"',
+            f'; without: {reason}',
+        ),
+    )
 
 
 def _texture(sample: Sample, health: Assessment) -> Finding:
@@ -445,44 +689,82 @@ def _texture(sample: Sample, health: Assessment) -> Finding:
     poor = float(np.mean(np.array(sample.matches) < _FEW_MATCHES))
     few = median < _NO_MATCHES or poor > 0.3
     return by_case(
-        'texture', f'{median:.0f} matches per pair in the median',
+        'texture',
+        f'{median:.0f} matches per pair in the median',
         {'median_matches': median, 'poor_share': poor},
-        Case(few and health.state is WRONG, UNKNOWN, 'check again with correct parameters: points '
-             'are predicted with the gyro'),
-        Case(median < _NO_MATCHES, WRONG,
-             'record a textured scene, in focus, with an exposure below 10 ms'),
-        Case(few, SUSPECT, 'more light, more texture or slower motion',
-             f', fewer than {_FEW_MATCHES} in {100 * poor:.0f} %'))
+        Case(
+            few and health.state is WRONG,
+            UNKNOWN,
+            'check again with correct parameters: points are predicted with the gyro',
+        ),
+        Case(
+            median < _NO_MATCHES,
+            WRONG,
+            'record a textured scene, in focus, with an exposure below 10 ms',
+        ),
+        Case(
+            few,
+            SUSPECT,
+            'more light, more texture or slower motion',
+            f', fewer than {_FEW_MATCHES} in {100 * poor:.0f} %',
+        ),
+    )
 
 
 def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found, health = completion.found, sample.health
     # No calibration finds another unit, nor axes that no rotation corrects.
-    beyond = any(fault.quantity == 'gyro_unit'
-                 or (fault.quantity == 'axes' and fault.estimated is None)
-                 for fault in health.faults)
+    beyond = any(
+        fault.quantity == 'gyro_unit' or (fault.quantity == 'axes' and fault.estimated is None)
+        for fault in health.faults
+    )
     if found is None or scan.intrinsics is None or beyond or not sample.is_lost:
         return health
-    wrong = check_recording.contradicted(found, completion.parameters.sensor,
-                         sensor_model(scan.intrinsics, completion.parameters.sensor))
+    wrong = check_recording.contradicted(
+        found,
+        completion.parameters.sensor,
+        sensor_model(scan.intrinsics, completion.parameters.sensor),
+    )
     if not wrong:
         return health
     named = {finding.quantity for finding in wrong}
     if not named.isdisjoint(_READOUT):
         named |= _READOUT
     unknown = {one.quantity: one for one in not_evaluated(named, wrong[0].quantity)}
-    return Assessment((*wrong, *(unknown.get(one.quantity, one) for one in health.findings
-                                 if one.quantity not in named)))
+    return Assessment(
+        (
+            *wrong,
+            *(
+                unknown.get(one.quantity, one)
+                for one in health.findings
+                if one.quantity not in named
+            ),
+        )
+    )
 
 
 def quantity_findings(health: Assessment, reason: str) -> Iterator[Finding]:
     """Findings on the quantities, by the sample; `reason`: why there are none."""
     for finding in health.findings:
         state = _state(finding)
-        yield replace(finding, state=state, fix='; '.join(filter(None, (
-            finding.fix, _MEASURE if state is not finding.state is OK else
-            'check again afterwards: a large deviation hides others' if state is WRONG else ''))))
+        yield replace(
+            finding,
+            state=state,
+            fix='; '.join(
+                filter(
+                    None,
+                    (
+                        finding.fix,
+                        _MEASURE
+                        if state is not finding.state is OK
+                        else 'check again afterwards: a large deviation hides others'
+                        if state is WRONG
+                        else '',
+                    ),
+                )
+            ),
+        )
     if not health.findings:
         for quantity in BY_NAME.values():
             yield Finding(quantity.name, UNKNOWN, f'not measured: {reason}', unit=quantity.unit)
@@ -490,12 +772,17 @@ def quantity_findings(health: Assessment, reason: str) -> Iterator[Finding]:
 
 def _state(finding: Finding) -> FindingState:
     """State of a parameter by itself: a certain deviation counts even if no pose suffers."""
-    if finding.configured is None or finding.estimated is None or finding.sigma is None or abs(
-            finding.estimated - finding.configured) < _CERTAIN * finding.sigma:
+    if (
+        finding.configured is None
+        or finding.estimated is None
+        or finding.sigma is None
+        or abs(finding.estimated - finding.configured) < _CERTAIN * finding.sigma
+    ):
         return finding.state
     quantity = BY_NAME.get('readout_time' if finding.quantity in _READOUT else finding.quantity)
-    if finding.state is WRONG or (quantity is not None and quantity.deviation(finding)
-                                  > _GROSS * quantity.observable):
+    if finding.state is WRONG or (
+        quantity is not None and quantity.deviation(finding) > _GROSS * quantity.observable
+    ):
         return WRONG
     return SUSPECT
 
@@ -503,8 +790,13 @@ def _state(finding: Finding) -> FindingState:
 def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
     """A parameter that is not configured, by the calibration."""
     found, quantity = completion.found, BY_NAME[name]
-    unknown = Finding(name, UNKNOWN, f'not configured, and not estimated: {completion.problem}',
-                      _MEASURE, unit=quantity.unit)
+    unknown = Finding(
+        name,
+        UNKNOWN,
+        f'not configured, and not estimated: {completion.problem}',
+        _MEASURE,
+        unit=quantity.unit,
+    )
     if found is None:
         return unknown
     estimate = found.rotation if name == 'axes' else found.readout_time
@@ -512,12 +804,20 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
         return replace(unknown, message=f'not configured, and not observable: {estimate.remark}')
     if name == 'readout_time':
         size = abs(estimate.value)
-        return replace(unknown, message=(
-            f'not configured; estimated {quantity.with_sigma(size, estimate.sigma)}'
-            + (', the last row first' if estimate.value < 0.0 else '')),
-            estimated=size, sigma=estimate.sigma, observable=True)
-    text = (f'quat_cam_imu_xyzw not configured; nearest map {axes_text(found.axis_map)}, '
-            f'{math.degrees(found.rotation.value):.1f} deg from it')
+        return replace(
+            unknown,
+            message=(
+                f'not configured; estimated {quantity.with_sigma(size, estimate.sigma)}'
+                + (', the last row first' if estimate.value < 0.0 else '')
+            ),
+            estimated=size,
+            sigma=estimate.sigma,
+            observable=True,
+        )
+    text = (
+        f'quat_cam_imu_xyzw not configured; nearest map {axes_text(found.axis_map)}, '
+        f'{math.degrees(found.rotation.value):.1f} deg from it'
+    )
     if len(scan.forces):
         down = -found.R_cam_imu @ scan.forces.mean(axis=0)
         axis = int(np.argmax(np.abs(down)))
@@ -539,18 +839,31 @@ def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding |
     elif configured is None:
         readout, source, state = _EXAMPLE_READOUT, ' (assumed; set readout_time)', UNKNOWN
     elif configured == 0.0:
-        return by_case(name, 'global shutter (readout_time 0)', {'readout_s': 0.0},
-                       Case(found is not None and found.state is OK, OK, '',
-                            ': no method needs to model rows'),
-                       Case(True, UNKNOWN, '', ', which this recording does not confirm'))
+        return by_case(
+            name,
+            'global shutter (readout_time 0)',
+            {'readout_s': 0.0},
+            Case(
+                found is not None and found.state is OK, OK, '', ': no method needs to model rows'
+            ),
+            Case(True, UNKNOWN, '', ', which this recording does not confirm'),
+        )
     assert readout is not None
     bias = np.array(parameters.imu.gyro_bias) if rest is None else rest.value
     rates = np.linalg.norm(scan.rates - bias, axis=1)
     median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
-    method = ('is sufficient' if high < _NO_EFFECT else
-              'is not sufficient' if median > _STRONG_EFFECT else 'loses accuracy')
-    return by_case(name, f'rotation displaces the last row by {median:.1f} px relative to the '
-                   f'first in the median, {high:.1f} px at 95 %, at a readout time of '
-                   f'{1e3 * readout:.1f} ms{source}: a global-shutter method {method}',
-                   {'readout_s': readout, 'median_px': median, 'p95_px': high},
-                   Case(True, state))
+    method = (
+        'is sufficient'
+        if high < _NO_EFFECT
+        else 'is not sufficient'
+        if median > _STRONG_EFFECT
+        else 'loses accuracy'
+    )
+    return by_case(
+        name,
+        f'rotation displaces the last row by {median:.1f} px relative to the '
+        f'first in the median, {high:.1f} px at 95 %, at a readout time of '
+        f'{1e3 * readout:.1f} ms{source}: a global-shutter method {method}',
+        {'readout_s': readout, 'median_px': median, 'p95_px': high},
+        Case(True, state),
+    )

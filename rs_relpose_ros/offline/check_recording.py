@@ -51,8 +51,8 @@ class Stamps:
         self.ns = np.array(stamps_ns, dtype=np.int64)
         self.count = len(self.ns)
         self.delay = float(np.median(delays)) if self.count else math.nan
-        self.duration = int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0   # [s]
-        self.steps = np.diff(self.ns) * 1e-9   # (N - 1,) [s]; some may be zero or negative
+        self.duration = int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0  # [s]
+        self.steps = np.diff(self.ns) * 1e-9  # (N - 1,) [s]; some may be zero or negative
         self.forwards = self.steps[self.steps > 0.0]
         self.longest = float(self.forwards.max(initial=0.0))
         # Median of the steps forwards [s], and 1.48 times their median deviation from it.
@@ -74,14 +74,14 @@ class Scan:
         self._stamps = {role: (array('q'), array('d')) for role in (Role.IMAGE, Role.IMU)}
         self._rates, self._forces = array('d'), array('d')
         self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
-        self.orientations = 0                                # of the IMU, with a covariance
-        self.encodings: Counter[str] = Counter()             # images by encoding or format
-        self.sizes: Counter[tuple[int, int]] = Counter()     # decoded images by (width, height)
-        self.largest_image = 0                         # message of an image [bytes]
+        self.orientations = 0  # of the IMU, with a covariance
+        self.encodings: Counter[str] = Counter()  # images by encoding or format
+        self.sizes: Counter[tuple[int, int]] = Counter()  # decoded images by (width, height)
+        self.largest_image = 0  # message of an image [bytes]
         self.intrinsics: Intrinsics | None = None
-        self.calibrations = 0                          # number of changes of them
-        self.unusable: Counter[Role] = Counter()       # messages
-        self.problems: dict[Role, str] = {}            # the first reason
+        self.calibrations = 0  # number of changes of them
+        self.unusable: Counter[Role] = Counter()  # messages
+        self.problems: dict[Role, str] = {}  # the first reason
 
     def add(self, role: Role, message: BagMessage) -> None:
         """Add the next message."""
@@ -106,8 +106,10 @@ class Scan:
             self.unusable[role] += 1
             self.problems.setdefault(role, str(error))
 
-    def added(self, source: Iterator[tuple[Role, BagMessage]],
-              ) -> Iterator[tuple[Role, BagMessage]]:
+    def added(
+        self,
+        source: Iterator[tuple[Role, BagMessage]],
+    ) -> Iterator[tuple[Role, BagMessage]]:
         """The messages of a source, each added."""
         for role, message in source:
             self.add(role, message)
@@ -171,8 +173,8 @@ class Completion(NamedTuple):
     """Parameters with the estimates of those that are not configured."""
 
     parameters: Parameters
-    found: CalibrationResult | None = None   # None if none was needed, or possible
-    problem: str = ''   # reason why a parameter is still missing
+    found: CalibrationResult | None = None  # None if none was needed, or possible
+    problem: str = ''  # reason why a parameter is still missing
 
 
 def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
@@ -180,13 +182,18 @@ def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calibr
     tracking, images = parameters.tracking, topics.image.count
     first = max(images - _CALIBRATED_IMAGES, 0) // 2
     recording = read_recording(
-        bag, topics, settings.TrackingConfig(detector=tracking.detector,
-                                             feature_rows=tracking.feature_rows),
-        images=range(first, first + min(images, _CALIBRATED_IMAGES)))
+        bag,
+        topics,
+        settings.TrackingConfig(detector=tracking.detector, feature_rows=tracking.feature_rows),
+        images=range(first, first + min(images, _CALIBRATED_IMAGES)),
+    )
     camera, given = recording.camera, parameters.intrinsics
     if given.given:
-        recording = replace(recording, focal_known=True, camera=given.of_image(
-            camera.width, camera.height).global_shutter_camera())
+        recording = replace(
+            recording,
+            focal_known=True,
+            camera=given.of_image(camera.width, camera.height).global_shutter_camera(),
+        )
     return recording.calibrated(settings.TRACKED_IN_IMAGES)
 
 
@@ -201,19 +208,24 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Complet
         return Completion(parameters, None, str(error))
     readout, axes = found.readout_time, found.rotation
     values: dict[str, Any] = {}
-    problems = [estimate.remark for name, estimate in (
-        ('quat_cam_imu_xyzw', axes), ('readout_time', readout))
-        if name in missing and not estimate.observable]
+    problems = [
+        estimate.remark
+        for name, estimate in (('quat_cam_imu_xyzw', axes), ('readout_time', readout))
+        if name in missing and not estimate.observable
+    ]
     if 'quat_cam_imu_xyzw' in missing and axes.observable:
         values['quat_cam_imu_xyzw'] = found.quat_cam_imu_xyzw
     if 'readout_time' in missing and readout.observable:
-        values |= {'readout_time': abs(readout.value),
-                   'readout_direction': 'up' if readout.value < 0.0 else 'down'}
+        values |= {
+            'readout_time': abs(readout.value),
+            'readout_direction': 'up' if readout.value < 0.0 else 'down',
+        }
     return Completion(parameters.updated(values), found, next(iter(problems), ''))
 
 
-def contradicted(found: CalibrationResult, sensor: settings.SensorConfig,
-                 model: Sensor) -> tuple[Finding, ...]:
+def contradicted(
+    found: CalibrationResult, sensor: settings.SensorConfig, model: Sensor
+) -> tuple[Finding, ...]:
     """Parameters that are far from the calibration `found`; `model` as configured.
 
     None if it has no time offset: images and gyro are independent.
@@ -224,45 +236,78 @@ def contradicted(found: CalibrationResult, sensor: settings.SensorConfig,
     angle = float(Rotation.from_matrix(found.R_cam_imu @ sensor.R_cam_imu.T).magnitude())
     # Of the stamped row; the calibration has that of row 0, at the median interval.
     share = camera.reference_row_index / camera.height
-    off = found.time_offset.value + share * readout.value - model.clock.reference_ns(
-        0, to_nanoseconds(found.frame_interval)) / NANOSECONDS
+    off = (
+        found.time_offset.value
+        + share * readout.value
+        - model.clock.reference_ns(0, to_nanoseconds(found.frame_interval)) / NANOSECONDS
+    )
     signed = camera.line_delay * camera.height
     axes_sigma = float(found.rotation_sigma.max())
     offset_sigma = math.hypot(found.time_offset.sigma, share * readout.sigma)
     by_readout = _contradiction('readout_time', abs(signed), abs(readout.value), readout.sigma)
     if np.sign(readout.value) * np.sign(signed) < 0.0:
         by_readout = replace(
-            by_readout, quantity='readout_direction', estimated=-abs(readout.value),
+            by_readout,
+            quantity='readout_direction',
+            estimated=-abs(readout.value),
             message=f'{by_readout.message}, in the opposite direction',
-            fix=f'set readout_direction: {"up" if readout.value < 0.0 else "down"}')
-    return tuple(finding for apart, sigma, least, finding in (
-        (angle, axes_sigma, _LEAST_ANGLE, _contradiction(
-            'axes', 0.0, math.degrees(angle), math.degrees(axes_sigma),
-            findings.rounded(found.quat_cam_imu_xyzw))),
-        (off, offset_sigma, _LEAST_TIME, _contradiction(
-            'time_offset', sensor.time_offset, sensor.time_offset + off, offset_sigma)),
-        (readout.value - signed, readout.sigma, _LEAST_TIME, by_readout),
-    ) if abs(apart) > max(_CERTAIN * sigma, least))
+            fix=f'set readout_direction: {"up" if readout.value < 0.0 else "down"}',
+        )
+    return tuple(
+        finding
+        for apart, sigma, least, finding in (
+            (
+                angle,
+                axes_sigma,
+                _LEAST_ANGLE,
+                _contradiction(
+                    'axes',
+                    0.0,
+                    math.degrees(angle),
+                    math.degrees(axes_sigma),
+                    findings.rounded(found.quat_cam_imu_xyzw),
+                ),
+            ),
+            (
+                off,
+                offset_sigma,
+                _LEAST_TIME,
+                _contradiction(
+                    'time_offset', sensor.time_offset, sensor.time_offset + off, offset_sigma
+                ),
+            ),
+            (readout.value - signed, readout.sigma, _LEAST_TIME, by_readout),
+        )
+        if abs(apart) > max(_CERTAIN * sigma, least)
+    )
 
 
-def _contradiction(name: str, configured: float, estimated: float, sigma: float,
-                   setting: object = None) -> Finding:
+def _contradiction(
+    name: str, configured: float, estimated: float, sigma: float, setting: object = None
+) -> Finding:
     quantity = BY_NAME[name]
-    return Finding(name, FindingState.WRONG,
-                   'by a calibration: ' + quantity.compared(estimated, sigma, configured),
-                   quantity.fix.format(estimated if setting is None else setting),
-                   configured, estimated, sigma, quantity.unit, True)
+    return Finding(
+        name,
+        FindingState.WRONG,
+        'by a calibration: ' + quantity.compared(estimated, sigma, configured),
+        quantity.fix.format(estimated if setting is None else setting),
+        configured,
+        estimated,
+        sigma,
+        quantity.unit,
+        True,
+    )
 
 
 class Sample(NamedTuple):
     """What the front end made of parts of a recording."""
 
     frames: int
-    matches: list[int]      # of each pair
+    matches: list[int]  # of each pair
     poses: int
-    reasons: ReasonCounts   # of frames that were not used, or of pairs without a pose
-    health: Assessment      # of each quantity the worst finding of all parts
-    is_refused: bool        # hardly any image could be used
+    reasons: ReasonCounts  # of frames that were not used, or of pairs without a pose
+    health: Assessment  # of each quantity the worst finding of all parts
+    is_refused: bool  # hardly any image could be used
 
     @property
     def few_poses(self) -> bool:
@@ -272,25 +317,29 @@ class Sample(NamedTuple):
     @property
     def is_lost(self) -> bool:
         """Whether a deviation may be too large to be estimated from pairs."""
-        return bool(self.matches) and (self.few_poses or not _FAR_OFF.isdisjoint(
-            fault.quantity for fault in self.health.faults))
+        return bool(self.matches) and (
+            self.few_poses
+            or not _FAR_OFF.isdisjoint(fault.quantity for fault in self.health.faults)
+        )
 
 
-def sampled(source: Iterable[tuple[Role, BagMessage]], images: int,
-            parameters: Parameters) -> Sample:
+def sampled(
+    source: Iterable[tuple[Role, BagMessage]], images: int, parameters: Parameters
+) -> Sample:
     """Parts of a recording of so many `images` through the front end.
 
     Parameters are used as configured: nothing is tracked, nothing is suppressed.
     """
     warm_up(parameters.estimator)
-    parameters = parameters.updated({'withhold_when_wrong': False, 'track_time_offset': False,
-                                     'track_readout_time': False})
+    parameters = parameters.updated(
+        {'withhold_when_wrong': False, 'track_time_offset': False, 'track_readout_time': False}
+    )
     front_end = FrontEnd(parameters, offline=True)
     # Indices of the first images of the parts, which overlap in a short recording.
     firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1) for part in range(_PARTS)]
     unused, poseless, matches, poses = ReasonCounts(), ReasonCounts(), list[int](), 0
     handed = done = frames = part_since_ns = last_ns = 0
-    before = findings.NOT_EVALUATED   # of the settled parts
+    before = findings.NOT_EVALUATED  # of the settled parts
 
     def chosen() -> Iterator[tuple[Role, BagMessage]]:
         """The messages without the images that belong to no part."""
@@ -298,8 +347,10 @@ def sampled(source: Iterable[tuple[Role, BagMessage]], images: int,
         index = -1
         for role, message in source:
             index += role is Role.IMAGE
-            if role is Role.IMAGE and (handed - done >= _MOST_WAITING or not any(
-                    0 <= index - first < _PART_IMAGES for first in firsts)):
+            if role is Role.IMAGE and (
+                handed - done >= _MOST_WAITING
+                or not any(0 <= index - first < _PART_IMAGES for first in firsts)
+            ):
                 try:
                     front_end.sequencer.pass_over(stamp_ns(message.message.header))
                 except RsRelposeError as error:
@@ -311,8 +362,9 @@ def sampled(source: Iterable[tuple[Role, BagMessage]], images: int,
     for outcome in outcomes(front_end, Intake(front_end.sequencer, parameters), chosen()):
         done += not isinstance(outcome, MessageRefused)
         if not isinstance(outcome, Frame):
-            unused.add(str(outcome.error) if isinstance(outcome, MessageRefused)
-                       else outcome.reason)
+            unused.add(
+                str(outcome.error) if isinstance(outcome, MessageRefused) else outcome.reason
+            )
             continue
         frames += 1
         if (pair := outcome.result) is None:
@@ -326,5 +378,11 @@ def sampled(source: Iterable[tuple[Role, BagMessage]], images: int,
             before = findings.worst_of(before, front_end.health)
         matches.append(len(pair.matches))
         last_ns = pair.stamp_ns
-    return Sample(frames, matches, poses, poseless if matches else unused,
-                  findings.worst_of(before, front_end.health), frames < _FEW_USED * handed)
+    return Sample(
+        frames,
+        matches,
+        poses,
+        poseless if matches else unused,
+        findings.worst_of(before, front_end.health),
+        frames < _FEW_USED * handed,
+    )

@@ -23,8 +23,12 @@ from rs_relpose_ros.pipeline.pair import PairResult
 _DPI = 110
 
 
-def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: PairResult,
-                truth: TrueTrajectory | None) -> list[Path]:
+def draw_replay(
+    paths: Sequence[Path],
+    records: Sequence[PairRecord],
+    shown: PairResult,
+    truth: TrueTrajectory | None,
+) -> list[Path]:
     """Draw matches of one pair, errors (with ground truth), residuals and rotation; the files."""
     matches, errors, residuals, rotation = paths
     with written(matches, 'wb') as file:
@@ -37,29 +41,42 @@ def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: Pai
     return [matches, errors, residuals, rotation]
 
 
-def draw_errors(records: Sequence[PairRecord], path: Path,
-                baselines: Mapping[str, Sequence[PairErrors | None]] | None = None) -> None:
+def draw_errors(
+    records: Sequence[PairRecord],
+    path: Path,
+    baselines: Mapping[str, Sequence[PairErrors | None]] | None = None,
+) -> None:
     """Errors over time, with estimated sigmas; `baselines`: those of other methods, by name."""
     picture = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
     known = [(r, r.errors) for r in records if r.pose and r.errors is not None]
     begins, ends = _spans([r for r, _ in known], start_ns)
     # Root of the mean square length of a 3-vector and a 2-vector with these sigmas.
-    series = (('rotation_error', rotation_sigmas, 'rotation error [deg]'),
-              ('translation_error', translation_sigmas, 'translation direction\nerror [deg]'))
+    series = (
+        ('rotation_error', rotation_sigmas, 'rotation error [deg]'),
+        ('translation_error', translation_sigmas, 'translation direction\nerror [deg]'),
+    )
     for axis, (name, sigmas_of, label) in zip(picture.axes, series, strict=True):
         if known:
             values = [getattr(e, name) for _, e in known]
             sigmas = [np.degrees(np.linalg.norm(sigmas_of(r.pose.covariance))) for r, _ in known]
-            axis.hlines(sigmas, begins, ends, color=ORANGE, linewidth=2.2,
-                        label='1 sigma, as estimated')
+            axis.hlines(
+                sigmas, begins, ends, color=ORANGE, linewidth=2.2, label='1 sigma, as estimated'
+            )
             axis.plot(0.5 * (begins + ends), values, 'o', color=BLUE, markersize=5, label='error')
             _median_line(axis, values, f'median error {np.median(values):.2g} deg')
             for (method, errors), color, marker in zip(
-                    (baselines or {}).items(), cycle((RED, GREEN)), cycle('+x12'), strict=False):
+                (baselines or {}).items(), cycle((RED, GREEN)), cycle('+x12'), strict=False
+            ):
                 others = [np.nan if e is None else getattr(e, name) for e in errors]
-                axis.plot(0.5 * (begins + ends), others, marker, color=color, markersize=6,
-                          label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg')
+                axis.plot(
+                    0.5 * (begins + ends),
+                    others,
+                    marker,
+                    color=color,
+                    markersize=6,
+                    label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg',
+                )
             axis.set_yscale('log')
             axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
             axis.yaxis.set_minor_formatter(NullFormatter())
@@ -77,8 +94,11 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     series = (
         ([f['residual_rms_px'] for f in known], 'residual of inliers,\nrms [px]'),
         ([100.0 * f['inlier_ratio'] for f in known], 'inliers [%]'),
-        ([f['rotation_difference_to_gyro_deg'] for f in known],
-         'rotation: images\nagainst gyro [deg]'))
+        (
+            [f['rotation_difference_to_gyro_deg'] for f in known],
+            'rotation: images\nagainst gyro [deg]',
+        ),
+    )
     for axis, (values, label) in zip(picture.axes, series, strict=True):
         finite = [value for value in values if np.isfinite(value)]
         if finite:
@@ -90,15 +110,22 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     _save_over_time(picture, path)
 
 
-def draw_rotation(records: Sequence[PairRecord], path: Path,
-                  truth: TrueTrajectory | None = None) -> None:
+def draw_rotation(
+    records: Sequence[PairRecord], path: Path, truth: TrueTrajectory | None = None
+) -> None:
     """Rotation accumulated over the pairs, against the ground truth or else the gyro."""
     unknown = np.full((3, 3), np.nan)
     gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
     # A pair without a rotation is bridged by the gyro, and its span is shaded.
-    chains = {'estimated': _accumulated([g if np.isnan(r.pose.R).any() else r.pose.R
-                                         for r, g in zip(records, gyro, strict=True)]),
-              'gyro alone': _accumulated(gyro)}
+    chains = {
+        'estimated': _accumulated(
+            [
+                g if np.isnan(r.pose.R).any() else r.pose.R
+                for r, g in zip(records, gyro, strict=True)
+            ]
+        ),
+        'gyro alone': _accumulated(gyro),
+    }
     against = 'gyro alone'
     if truth is not None:
         poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
@@ -106,31 +133,67 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
         chains[against] = _accumulated([unknown if pose is None else pose[0] for pose in poses])
     start_ns = records[0].reference_ns1
     times = [0.0, *_spans(records, start_ns)[1]]
-    picture = _over_time(2, 'orientation against the first keyframe: the rotations of the pairs, '
-                         'chained')
+    picture = _over_time(
+        2, 'orientation against the first keyframe: the rotations of the pairs, chained'
+    )
     above, below = picture.axes
     # Rotation vectors (N, 3) [deg].
-    estimated, reference = (np.degrees([
-        Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else np.full(3, np.nan)
-        for R in chains[name]]) for name in ('estimated', against))
+    estimated, reference = (
+        np.degrees(
+            [
+                Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else np.full(3, np.nan)
+                for R in chains[name]
+            ]
+        )
+        for name in ('estimated', against)
+    )
     for column, color in enumerate((BLUE, RED, GREEN)):
-        above.plot(times, estimated[:, column], 'o-', color=color, markersize=3, linewidth=1.6,
-                   label=f'{"xyz"[column]} ({("right", "down", "forward")[column]})')
-        above.plot(times, reference[:, column], '--', color='black', linewidth=1.0,
-                   label=against if column == 2 else None)
+        above.plot(
+            times,
+            estimated[:, column],
+            'o-',
+            color=color,
+            markersize=3,
+            linewidth=1.6,
+            label=f'{"xyz"[column]} ({("right", "down", "forward")[column]})',
+        )
+        above.plot(
+            times,
+            reference[:, column],
+            '--',
+            color='black',
+            linewidth=1.0,
+            label=against if column == 2 else None,
+        )
     above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
     for (name, chain), color in zip(chains.items(), (BLUE, ORANGE), strict=False):
         if name != against:
-            angles = [rotation_angle(R.T @ R_against)
-                      for R, R_against in zip(chain, chains[against], strict=True)]
-            below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4,
-                       label=f'{name} against {against}')
+            angles = [
+                rotation_angle(R.T @ R_against)
+                for R, R_against in zip(chain, chains[against], strict=True)
+            ]
+            below.plot(
+                times,
+                angles,
+                'o-',
+                color=color,
+                markersize=3,
+                linewidth=1.4,
+                label=f'{name} against {against}',
+            )
     below.set_ylabel('difference, accumulated\n[deg]')
-    below.set_title('drift of the chain: errors of pairs accumulate, as in any odometry',
-                    fontsize=9, loc='left')
+    below.set_title(
+        'drift of the chain: errors of pairs accumulate, as in any odometry',
+        fontsize=9,
+        loc='left',
+    )
     below.set_ylim(bottom=0.0)
-    _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
-                   'no rotation: gyro instead')
+    _shade_no_pose(
+        below,
+        [r for r in records if np.isnan(r.pose.R).any()],
+        start_ns,
+        'no rotation: gyro instead',
+    )
     _save_over_time(picture, path)
 
 
@@ -154,8 +217,9 @@ def _median_line(axis: Axes, values: Sequence[float], label: str) -> None:
     axis.axhline(float(np.median(values)), color=BLUE, linestyle='--', linewidth=1.0, label=label)
 
 
-def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
-                   label: str = '') -> None:
+def _shade_no_pose(
+    axis: Axes, records: Sequence[PairRecord], start_ns: int, label: str = ''
+) -> None:
     """Spans of the pairs without a pose, one entry of the legend per status."""
     labelled = set()
     hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..', Status.WITHHELD: 'xx'}
@@ -164,16 +228,25 @@ def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
             continue
         text = label or f'no pose: {record.pose.status.value}'
         (begin,), (end,) = _spans([record], start_ns)
-        axis.axvspan(begin, end, facecolor='0.6', alpha=0.35, edgecolor='0.3', linewidth=0.0,
-                     hatch=hatches.get(record.pose.status, '//'),
-                     label=None if text in labelled else text)
+        axis.axvspan(
+            begin,
+            end,
+            facecolor='0.6',
+            alpha=0.35,
+            edgecolor='0.3',
+            linewidth=0.0,
+            hatch=hatches.get(record.pose.status, '//'),
+            label=None if text in labelled else text,
+        )
         labelled.add(text)
 
 
 def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[Array, Array]:
     """Times (N,) of the reference rows of both frames of the pairs [s]."""
-    return (np.array([seconds_between(start_ns, r.reference_ns1) for r in records]),
-            np.array([seconds_between(start_ns, r.reference_ns2) for r in records]))
+    return (
+        np.array([seconds_between(start_ns, r.reference_ns1) for r in records]),
+        np.array([seconds_between(start_ns, r.reference_ns2) for r in records]),
+    )
 
 
 def _accumulated(rotations: Sequence[Array]) -> list[Array]:

@@ -51,7 +51,7 @@ class MessageRefused:
     role: Role
     topic: str
     error: RsRelposeError
-    stamp_ns: None = None   # it belongs to no frame
+    stamp_ns: None = None  # it belongs to no frame
 
     @property
     def reason(self) -> str:
@@ -64,8 +64,11 @@ class MessageRefused:
             raise type(self.error)(self.reason) from self.error
 
 
-def outcomes(loop: FrameLoop[Result], intake: Intake, source: Iterable[tuple[Role, BagMessage]],
-             ) -> Iterator[Outcome[Result] | MessageRefused]:
+def outcomes(
+    loop: FrameLoop[Result],
+    intake: Intake,
+    source: Iterable[tuple[Role, BagMessage]],
+) -> Iterator[Outcome[Result] | MessageRefused]:
     """Feed a source to the end, and yield what becomes of each frame, as soon as it is known."""
     for role, message in source:
         error = intake.receive(role, message.message)
@@ -98,8 +101,15 @@ class Replay:
     `keep_images`: whether pairs have their current image.
     """
 
-    def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
-                 stamps: frozenset[int] | None = None, keep_images: bool = False) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        topics: SensorTopics,
+        parameters: Parameters,
+        *,
+        stamps: frozenset[int] | None = None,
+        keep_images: bool = False,
+    ) -> None:
         need_sensor_parameters(parameters)
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
@@ -108,7 +118,7 @@ class Replay:
         self.invalid_messages = self.failed_frames = self.pair_count = 0
         # Wall times [s]: of the whole without compilation, and of tracking and estimation.
         self.seconds = self.processing_seconds = 0.0
-        self.first_ns = self.last_ns = 0   # bag times of the first and of the last message so far
+        self.first_ns = self.last_ns = 0  # bag times of the first and of the last message so far
         # Unused frames and messages, by the first message of each reason.
         self.reasons = ReasonCounts()
 
@@ -135,14 +145,19 @@ class Replay:
         if self._stamps is not None:
             absent = len(self._stamps - self.intake.stamps_found)
             if absent == len(self._stamps):
-                raise InputError(f'none of the {absent} chosen stamps is the stamp of an image on '
-                                 f'{self._topics.image.name}')
+                raise InputError(
+                    f'none of the {absent} chosen stamps is the stamp of an image on '
+                    f'{self._topics.image.name}'
+                )
             if absent:
-                _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
-                                len(self._stamps))
+                _logger.warning(
+                    '%d of the %d chosen stamps are not in the bag', absent, len(self._stamps)
+                )
         most = next(iter(self.reasons.most_common()), None)
-        if most is not None and (not self.sequencer.counts().frames_taken
-                                 or (self.failed_frames and not self.pair_count)):
+        if most is not None and (
+            not self.sequencer.counts().frames_taken
+            or (self.failed_frames and not self.pair_count)
+        ):
             raise InputError(f'no frame of {self._bag.path} could be used: {most}')
 
     @property
@@ -162,16 +177,23 @@ class ReplayOutcome:
     """Results of a replay, or of a list of pairs."""
 
     records: list[PairRecord]
-    metrics: dict[str, Any]   # content of summary.json without provenance
-    health: Assessment   # the worst finding of each configured parameter
-    files: list[Path]   # written so far: tables, bag and pictures
-    intrinsics: Intrinsics | None   # active at the end
+    metrics: dict[str, Any]  # content of summary.json without provenance
+    health: Assessment  # the worst finding of each configured parameter
+    files: list[Path]  # written so far: tables, bag and pictures
+    intrinsics: Intrinsics | None  # active at the end
 
 
-def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
-                stamps: frozenset[int] | None = None, pictures: bool = True,
-                with_bag: bool = False,
-                on_pair: Callable[[PairResult], object] = lambda pair: None) -> ReplayOutcome:
+def replay_into(
+    folder: Path,
+    bag: Bag,
+    topics: SensorTopics,
+    parameters: Parameters,
+    *,
+    stamps: frozenset[int] | None = None,
+    pictures: bool = True,
+    with_bag: bool = False,
+    on_pair: Callable[[PairResult], object] = lambda pair: None,
+) -> ReplayOutcome:
     """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
 
     Files of an earlier run are replaced. `stamps`: as of `Replay`; `with_bag`: of the node's
@@ -208,13 +230,16 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     if shown is not None:
         # Imports Matplotlib, which takes a second.
         from rs_relpose_ros.offline.pictures import draw_replay
+
         files += draw_replay([folder / name for name in PICTURES], records, shown, truth)
-    return ReplayOutcome(records, _summary(records, run, last, health), health, files,
-                         run.intake.intrinsics)
+    return ReplayOutcome(
+        records, _summary(records, run, last, health), health, files, run.intake.intrinsics
+    )
 
 
-def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
-             health: Assessment) -> dict[str, Any]:
+def _summary(
+    records: list[PairRecord], run: Replay, last: PairResult | None, health: Assessment
+) -> dict[str, Any]:
     """Content of summary.json; medians are over the pairs with a pose, null without any."""
     answered = [record for record in records if record.pose]
     sequencer, seconds = run.sequencer.counts(), run.processing_seconds
@@ -239,8 +264,10 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
         'health': health.as_json(),
         'invalid_messages': run.invalid_messages,
         'not_used': run.reasons.most_common(),
-        'medians': {metric.name: median([record.metrics[metric.name] for record in answered])
-                    for metric in PAIR_METRICS},
+        'medians': {
+            metric.name: median([record.metrics[metric.name] for record in answered])
+            for metric in PAIR_METRICS
+        },
         'baselines': tables.baselines(answered),
         'errors_against_truth': tables.errors_against_truth(answered),
         'timing': {
@@ -256,8 +283,11 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
 def pair_counts(records: list[PairRecord]) -> dict[str, Any]:
     """Numbers of pairs for summary.json."""
     by_status = Counter(record.pose.status for record in records)
-    return {'total': len(records), 'answered': sum(bool(record.pose) for record in records),
-            'by_status': {status.value: by_status[status] for status in Status}}
+    return {
+        'total': len(records),
+        'answered': sum(bool(record.pose) for record in records),
+        'by_status': {status.value: by_status[status] for status in Status},
+    }
 
 
 def _tracked(last: PairResult | None) -> dict[str, Any] | None:
@@ -280,12 +310,16 @@ def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
     """Ground truth of the camera; None if the bag has none."""
     if topics.truth is None:
         return None
-    poses = [PARTS[role].read(message.message)
-             for role, message in sensor_messages(bag, topics, (Role.TRUTH,))]
+    poses = [
+        PARTS[role].read(message.message)
+        for role, message in sensor_messages(bag, topics, (Role.TRUTH,))
+    ]
     try:
-        return TrueTrajectory([pose.stamp_ns for pose in poses],
-                              np.array([pose.position for pose in poses]),
-                              np.array([pose.quat_xyzw for pose in poses]))
+        return TrueTrajectory(
+            [pose.stamp_ns for pose in poses],
+            np.array([pose.position for pose in poses]),
+            np.array([pose.quat_xyzw for pose in poses]),
+        )
     except InputError as error:
         raise InputError(f'{topics.truth.name}: {error}') from error
 
@@ -304,8 +338,11 @@ def read_stamps(path: Path | str) -> frozenset[int]:
 # Columns of the list, those of the tables of `replay`: these are valid lists.
 LIST_COLUMNS = POSES.columns[:2]
 # The table of `replay`, and the reason of a pair without a pose.
-CHOSEN_POSES = tables.Table(POSES.file, (*POSES.columns, 'reason'), lambda record: [
-    *(POSES.row(record) or ()), record.pose.reason])
+CHOSEN_POSES = tables.Table(
+    POSES.file,
+    (*POSES.columns, 'reason'),
+    lambda record: [*(POSES.row(record) or ()), record.pose.reason],
+)
 
 
 def read_pairs(path: Path) -> list[Stamps]:
@@ -313,37 +350,47 @@ def read_pairs(path: Path) -> list[Stamps]:
     with check_file(path).open(newline='', encoding='utf-8-sig', errors='replace') as file:
         rows = csv.DictReader(file)
         places = (Row(path, rows.line_num, row) for row in rows)
-        pairs = [(row.nanoseconds(LIST_COLUMNS[0]), row.nanoseconds(LIST_COLUMNS[1]))
-                 for row in places]
+        pairs = [
+            (row.nanoseconds(LIST_COLUMNS[0]), row.nanoseconds(LIST_COLUMNS[1])) for row in places
+        ]
     if not pairs:
-        raise InputError(f'{path} has no pairs below a line with the column names '
-                         f'{" and ".join(LIST_COLUMNS)}')
+        raise InputError(
+            f'{path} has no pairs below a line with the column names {" and ".join(LIST_COLUMNS)}'
+        )
     return pairs
 
 
-def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-               pairs: Sequence[Stamps]) -> ReplayOutcome:
+def pairs_into(
+    folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, pairs: Sequence[Stamps]
+) -> ReplayOutcome:
     """Write a row for each of the pairs, in their order, into tables in `folder`."""
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE))
     truth = read_truth(bag, topics)
     results, intrinsics = related(bag, topics, parameters, pairs)
     records = [
-        PairRecord.of(result, truth) if isinstance(result, PairResult)
+        PairRecord.of(result, truth)
+        if isinstance(result, PairResult)
         else PairRecord(*pair, RelativePose(status=Status.BAD_INPUT, reason=result))
-        for pair, result in zip(pairs, results, strict=True)]
+        for pair, result in zip(pairs, results, strict=True)
+    ]
     written = (CHOSEN_POSES,) if truth is None else (CHOSEN_POSES, ERRORS)
     with tables.table_writer(folder, written) as write:
         for record in records:
             write(record)
-    metrics = {'pairs': pair_counts(records),
-               'errors_against_truth': tables.errors_against_truth(
-                   [record for record in records if record.pose])}
-    return ReplayOutcome(records, metrics, NOT_EVALUATED,
-                         [folder / table.file for table in written], intrinsics)
+    metrics = {
+        'pairs': pair_counts(records),
+        'errors_against_truth': tables.errors_against_truth(
+            [record for record in records if record.pose]
+        ),
+    }
+    return ReplayOutcome(
+        records, metrics, NOT_EVALUATED, [folder / table.file for table in written], intrinsics
+    )
 
 
-def related(bag: Bag, topics: SensorTopics, parameters: Parameters,
-            pairs: Sequence[Stamps]) -> tuple[list[PairResult | str], Intrinsics | None]:
+def related(
+    bag: Bag, topics: SensorTopics, parameters: Parameters, pairs: Sequence[Stamps]
+) -> tuple[list[PairResult | str], Intrinsics | None]:
     """Results of the pairs, or the reasons why they were not estimated; active intrinsics."""
     warm_up(parameters.estimator)
     wanted = [pair for pair in pairs if pair[0] < pair[1]]
@@ -362,8 +409,9 @@ def related(bag: Bag, topics: SensorTopics, parameters: Parameters,
 
     def reason(first: int, second: int) -> str:
         if first >= second:
-            return (f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: '
-                    + ('give two different images' if first == second else 'exchange them'))
+            return f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: ' + (
+                'give two different images' if first == second else 'exchange them'
+            )
         for stamp in (first, second):
             if stamp not in intake.stamps_found:
                 return f'no image on {topics.image.name} has the stamp {stamp}'
@@ -371,5 +419,6 @@ def related(bag: Bag, topics: SensorTopics, parameters: Parameters,
                 return f'the image of {stamp} cannot be used: {problems[stamp]}'
         return 'the clock of the images jumped back between the two'
 
-    return [results[pair] if pair in results else reason(*pair)
-            for pair in pairs], intake.intrinsics
+    return [
+        results[pair] if pair in results else reason(*pair) for pair in pairs
+    ], intake.intrinsics

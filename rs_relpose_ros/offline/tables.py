@@ -27,20 +27,26 @@ class PairRecord:
     stamp_ns: int
     pose: RelativePose
     # The rest is unknown for a pair that was not estimated.
-    reference_ns1: int = 0   # as in `PairResult`
+    reference_ns1: int = 0  # as in `PairResult`
     reference_ns2: int = 0
     gyro_rotation: Array | None = None
-    metrics: Mapping[str, float] = field(default_factory=dict)   # `PAIR_METRICS` by name
-    errors: PairErrors | None = None   # also None without ground truth
+    metrics: Mapping[str, float] = field(default_factory=dict)  # `PAIR_METRICS` by name
+    errors: PairErrors | None = None  # also None without ground truth
 
     @classmethod
     def of(cls, result: PairResult, truth: TrueTrajectory | None = None) -> Self:
         """Record of a pair, with its errors if there is ground truth."""
         pose, ns1, ns2 = result.pose, result.reference_ns1, result.reference_ns2
-        return cls(result.reference_stamp_ns, result.stamp_ns, pose, ns1, ns2,
-                   result.gyro_rotation,
-                   {metric.name: metric.of(result) for metric in PAIR_METRICS},
-                   None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2))
+        return cls(
+            result.reference_stamp_ns,
+            result.stamp_ns,
+            pose,
+            ns1,
+            ns2,
+            result.gyro_rotation,
+            {metric.name: metric.of(result) for metric in PAIR_METRICS},
+            None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2),
+        )
 
 
 class Table(NamedTuple):
@@ -64,16 +70,50 @@ def _pose_row(record: PairRecord) -> list[str]:
     covariance, known = np.full((6, 6), math.nan), slice(0 if pose else 3, 6)
     published = published_covariance(pose.covariance[known, known])
     covariance[known, known] = published.reshape(covariance[known, known].shape)
-    values = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(covariance),
-              *rotation_sigmas(covariance)]
-    return [*stamps, *map(number, values), number(record.metrics['inliers']), matches, pose.model,
-            pose.status.value, number(pose.baseline), number(pose.baseline_log_sigma)]
+    values = [
+        *pose.t,
+        *quat_xyzw(pose.R),
+        *translation_sigmas(covariance),
+        *rotation_sigmas(covariance),
+    ]
+    return [
+        *stamps,
+        *map(number, values),
+        number(record.metrics['inliers']),
+        matches,
+        pose.model,
+        pose.status.value,
+        number(pose.baseline),
+        number(pose.baseline_log_sigma),
+    ]
 
 
-POSES = Table('relative_poses.csv', (
-    'reference_stamp_ns', 'stamp_ns', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',
-    'sigma_t2', 'sigma_rx', 'sigma_ry', 'sigma_rz', 'inliers', 'matches', 'model', 'status',
-    'baseline_m', 'baseline_log_sigma'), _pose_row)
+POSES = Table(
+    'relative_poses.csv',
+    (
+        'reference_stamp_ns',
+        'stamp_ns',
+        'tx',
+        'ty',
+        'tz',
+        'qx',
+        'qy',
+        'qz',
+        'qw',
+        'sigma_t1',
+        'sigma_t2',
+        'sigma_rx',
+        'sigma_ry',
+        'sigma_rz',
+        'inliers',
+        'matches',
+        'model',
+        'status',
+        'baseline_m',
+        'baseline_log_sigma',
+    ),
+    _pose_row,
+)
 
 
 def _error_row(record: PairRecord) -> list[str] | None:
@@ -82,23 +122,52 @@ def _error_row(record: PairRecord) -> list[str] | None:
         return None
     errors = record.errors
     # PURE_ROTATION has a rotation, but is no pose.
-    values = [''] * 4 if errors is None else [number(value) for value in (
-        errors.baseline, errors.rotation, errors.rotation_error, errors.translation_error)]
-    return [str(record.reference_stamp_ns), str(record.stamp_ns),
-            number(record.metrics['interval_s']), *values, record.pose.status.value]
+    values = (
+        [''] * 4
+        if errors is None
+        else [
+            number(value)
+            for value in (
+                errors.baseline,
+                errors.rotation,
+                errors.rotation_error,
+                errors.translation_error,
+            )
+        ]
+    )
+    return [
+        str(record.reference_stamp_ns),
+        str(record.stamp_ns),
+        number(record.metrics['interval_s']),
+        *values,
+        record.pose.status.value,
+    ]
 
 
-ERRORS = Table('errors.csv', (
-    'reference_stamp_ns', 'stamp_ns', 'interval_s', 'baseline_m', 'rotation_deg',
-    'rotation_error_deg', 'translation_error_deg', 'status'), _error_row)
+ERRORS = Table(
+    'errors.csv',
+    (
+        'reference_stamp_ns',
+        'stamp_ns',
+        'interval_s',
+        'baseline_m',
+        'rotation_deg',
+        'rotation_error_deg',
+        'translation_error_deg',
+        'status',
+    ),
+    _error_row,
+)
 
 
 @contextmanager
 def table_writer(folder: Path, tables: Sequence[Table]) -> Iterator[Callable[[PairRecord], None]]:
     """Create files of tables, each row complete; the result appends a record to all of them."""
     with ExitStack() as stack:
-        writers = [csv.writer(stack.enter_context(
-            written(folder / table.file)), lineterminator='\n') for table in tables]
+        writers = [
+            csv.writer(stack.enter_context(written(folder / table.file)), lineterminator='\n')
+            for table in tables
+        ]
 
         def write(record: PairRecord) -> None:
             for table, writer in zip(tables, writers, strict=True):
@@ -138,8 +207,11 @@ def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
             reasons.add(record.pose.baseline_reason)
         else:
             known.append(record.pose.baseline_log_sigma)
-    return {'known': len(known), 'log_sigma_median': median(known),
-            'not_known': reasons.most_common()}
+    return {
+        'known': len(known),
+        'log_sigma_median': median(known),
+        'not_known': reasons.most_common(),
+    }
 
 
 def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
@@ -151,7 +223,8 @@ def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | Non
     for name in ('rotation', 'translation'):
         values = [getattr(error, f'{name}_error') for error in errors]
         metrics[f'{name}_median_deg'], metrics[f'{name}_p90_deg'] = map(
-            _finite, median_and_p90(values))
+            _finite, median_and_p90(values)
+        )
     return {**metrics, 'baseline_median_m': median([error.baseline for error in errors])}
 
 

@@ -21,10 +21,10 @@ _MIN_POSES = 4
 class PairErrors:
     """True motion of a pair and the errors of its estimate; unknown values are NaN."""
 
-    baseline: float   # true distance of the two positions [m]
-    rotation: float   # true angle [deg]
-    rotation_error: float   # angle of R_estimated^T R_true [deg]
-    translation_error: float   # angle between the directions of translation [deg], 0 to 180
+    baseline: float  # true distance of the two positions [m]
+    rotation: float  # true angle [deg]
+    rotation_error: float  # angle of R_estimated^T R_true [deg]
+    translation_error: float  # angle between the directions of translation [deg], 0 to 180
 
 
 class TrueTrajectory:
@@ -41,13 +41,20 @@ class TrueTrajectory:
         positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)[order]
         quats = np.asarray(quats_xyzw, dtype=np.float64).reshape(-1, 4)[order]
         if len(order) < _MIN_POSES:
-            raise InputError(f'the ground truth has {len(order)} poses of distinct stamps; at '
-                             f'least {_MIN_POSES} are needed')
-        norms = np.linalg.norm(quats.clip(-2.0, 2.0), axis=1)   # squares of damaged ones overflow
-        if not (np.isfinite(positions).all() and np.isfinite(quats).all()
-                and (np.abs(norms - 1.0) < 1e-2).all()):
-            raise InputError('the ground truth has a pose that is not finite, or whose quaternion '
-                             'has not the length 1')
+            raise InputError(
+                f'the ground truth has {len(order)} poses of distinct stamps; at '
+                f'least {_MIN_POSES} are needed'
+            )
+        norms = np.linalg.norm(quats.clip(-2.0, 2.0), axis=1)  # squares of damaged ones overflow
+        if not (
+            np.isfinite(positions).all()
+            and np.isfinite(quats).all()
+            and (np.abs(norms - 1.0) < 1e-2).all()
+        ):
+            raise InputError(
+                'the ground truth has a pose that is not finite, or whose quaternion '
+                'has not the length 1'
+            )
         self._stamps = stamps[order]
         # Seconds since the first pose: absolute stamps do not fit into a float.
         seconds = (self._stamps - self._stamps[0]) / NANOSECONDS
@@ -59,7 +66,8 @@ class TrueTrajectory:
         after = int(np.searchsorted(self._stamps, at_ns))
         return after < len(self._stamps) and bool(
             self._stamps[after] == at_ns
-            or (after > 0 and self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS))
+            or (after > 0 and self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
+        )
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""
@@ -85,11 +93,16 @@ class TrueTrajectory:
             return None
         R_true, t_true = truth
         return PairErrors(
-            baseline=float(np.linalg.norm(t_true)), rotation=rotation_angle(R_true),
+            baseline=float(np.linalg.norm(t_true)),
+            rotation=rotation_angle(R_true),
             rotation_error=rotation_angle(R.T @ R_true),
             # The arc cosine loses digits at small angles.
-            translation_error=float(np.degrees(np.arctan2(
-                np.linalg.norm(np.cross(t, t_true)), t @ t_true))) if t_true.any() else np.nan)
+            translation_error=float(
+                np.degrees(np.arctan2(np.linalg.norm(np.cross(t, t_true)), t @ t_true))
+            )
+            if t_true.any()
+            else np.nan,
+        )
 
 
 def rotation_angle(R: Array) -> float:

@@ -24,12 +24,13 @@ class Unrolling:
     receive times, which are indexed.
     """
 
-    def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                 writer: BagWriter) -> None:
-        self.images_in_bag = self.images = 0   # those that were derotated and written
-        self.largest_shift = 0.0   # [px] of any pixel
-        self.copied = self.topics_copied = 0   # messages of other topics
-        self.reasons = ReasonCounts()   # of omitted images
+    def __init__(
+        self, bag: Bag, topics: SensorTopics, parameters: Parameters, writer: BagWriter
+    ) -> None:
+        self.images_in_bag = self.images = 0  # those that were derotated and written
+        self.largest_shift = 0.0  # [px] of any pixel
+        self.copied = self.topics_copied = 0  # messages of other topics
+        self.reasons = ReasonCounts()  # of omitted images
         self.warnings: list[str] = []
         self._bag, self._topics, self._writer = bag, topics, writer
         self._loop = unrolling_loop(parameters, offline=True)
@@ -55,20 +56,26 @@ class Unrolling:
             if isinstance(outcome, MessageRefused) and not self.images:
                 outcome.raise_without_intrinsics()
             self.reasons.add(unused_reason(outcome))
-        self.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
-                          for topic in self._bag.topics if topic not in copied]
+        self.warnings += [
+            f'{topic} is omitted: ROS 2 has no such message type'
+            for topic in self._bag.topics
+            if topic not in copied
+        ]
         shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
         if shared and stamp_clock == 'imu':
             self.warnings.append(
                 f'{", ".join(shared)} had the stamps of the derotated images and keep them, on '
                 "the camera's clock: set stamp_clock=camera if they are used together (depth, "
-                'stereo)')
+                'stereo)'
+            )
 
     def _messages(self, topics: list[Topic]) -> Iterator[tuple[Role, BagMessage]]:
         """Messages of camera and IMU; all but images and CameraInfo are copied."""
-        roles = {(topic.name, topic.msgtype): role for role in (
-            Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
-            if (topic := getattr(self._topics, role.value)) is not None}
+        roles = {
+            (topic.name, topic.msgtype): role
+            for role in (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
+            if (topic := getattr(self._topics, role.value)) is not None
+        }
         for raw in self._bag.raw_messages(topics):
             role = roles.get((raw.topic, raw.msgtype))
             if role not in (Role.IMAGE, Role.CAMERA_INFO):
@@ -77,7 +84,8 @@ class Unrolling:
             if role is None:
                 if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
                     self._shared.setdefault(raw.topic, []).append(
-                        stamp_ns(self._bag.read(raw).header) in self._times)
+                        stamp_ns(self._bag.read(raw).header) in self._times
+                    )
                 continue
             message = self._bag.read(raw)
             if role is Role.IMAGE:
@@ -94,11 +102,14 @@ class Unrolling:
         """Write an image with its CameraInfo."""
         topic, info, types = self._topics.image, self._topics.camera_info, self._writer.type
         header, pixels = (result.stamp_ns, result.frame_id), result.image()
-        image = (outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
-                 if topic.msgtype == reader.COMPRESSED_IMAGE
-                 else outgoing.image_message(*header, pixels, types))
+        image = (
+            outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
+            if topic.msgtype == reader.COMPRESSED_IMAGE
+            else outgoing.image_message(*header, pixels, types)
+        )
         camera_info = outgoing.camera_info_message(
-            *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types)
+            *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types
+        )
         name = topic.camera_info if info is None else info.name
         self._writer.write(name, reader.CAMERA_INFO, camera_info, bag_time_ns)
         self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)

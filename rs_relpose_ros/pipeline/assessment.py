@@ -66,10 +66,10 @@ class Configured:
 
     sensor: SensorConfig
     camera: RollingShutterCamera
-    gyro_bias: Array   # (3,) parameter [rad/s]
-    sigmas: Array   # (11,) configured, of the deviations; 0 if not known
-    active: Array   # (11,) deviations applied already: tracked parameters, bias at rest
-    center_sigma: float = 0.0   # [px] of the principal point, per axis
+    gyro_bias: Array  # (3,) parameter [rad/s]
+    sigmas: Array  # (11,) configured, of the deviations; 0 if not known
+    active: Array  # (11,) deviations applied already: tracked parameters, bias at rest
+    center_sigma: float = 0.0  # [px] of the principal point, per axis
 
     @property
     def direction(self) -> float:
@@ -85,8 +85,9 @@ def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
     sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(findings.DEVIATIONS)
     sigmas[findings.AXES] = sensor.axes_sigma
     sigmas[findings.BIAS] = parameters.imu.gyro_bias_sigma
-    sigmas[findings.OFFSET] = math.hypot(sensor.time_offset_sigma, (
-        from_reference * sensor.time_offset_per_interval_sigma))
+    sigmas[findings.OFFSET] = math.hypot(
+        sensor.time_offset_sigma, (from_reference * sensor.time_offset_per_interval_sigma)
+    )
     sigmas[findings.READOUT] = sensor.readout_time_sigma
     sigmas[[findings.FOCAL, findings.DISTORTION]] = lens.focal_length_sigma, lens.distortion_sigma
     return sigmas
@@ -95,26 +96,27 @@ def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
 class Effect(NamedTuple):
     """Shift of a pair's pose by deviations, or of its rotation alone if it has no translation."""
 
-    shift: Array   # (5 or 3, 11) in sigmas of a correctly configured pose
-    claimed_shift: Array   # (6 or 3, 11) in published sigmas, which may include the disagreement
+    shift: Array  # (5 or 3, 11) in sigmas of a correctly configured pose
+    claimed_shift: Array  # (6 or 3, 11) in published sigmas, which may include the disagreement
 
 
 class Inconsistency(NamedTuple):
     """A quantity whose deviation is consistent with the pairs."""
 
     quantity: Quantity
-    deviation: Array   # (11,) from the active values; of this quantity alone
-    sigma: Array   # (11,)
-    certainty: float   # in sigmas
+    deviation: Array  # (11,) from the active values; of this quantity alone
+    sigma: Array  # (11,)
+    certainty: float  # in sigmas
     # Of the pose, Mahalanobis: in sigmas of a correctly configured one, of the pairs that it
     # moves most, and in published sigmas, in the median.
     shift: float
     claimed_shift: float
-    alternative: Inconsistency | None = None   # hypothesis that fits the pairs as well
+    alternative: Inconsistency | None = None  # hypothesis that fits the pairs as well
 
 
-def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
-                         configured: Configured) -> list[Inconsistency]:
+def find_inconsistencies(
+    estimated: Calibration, effects: Sequence[Effect], configured: Configured
+) -> list[Inconsistency]:
     """The fewest deviations that fit the pairs, by forward selection; the strongest first.
 
     A fit of all quantities would distribute a deviation of one among all that few pairs cannot
@@ -125,25 +127,38 @@ def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
     selected = np.zeros(findings.DEVIATIONS, dtype=bool)
     together = _solved(selected, estimated, configured)
     while len(found) < _MOST_QUANTITIES:
-        (quantity, solution), (second, other) = _ranked([
-            quantity for quantity in findings.QUANTITIES if not selected[quantity.part].any()],
-            selected, estimated, configured)[:2]
+        (quantity, solution), (second, other) = _ranked(
+            [quantity for quantity in findings.QUANTITIES if not selected[quantity.part].any()],
+            selected,
+            estimated,
+            configured,
+        )[:2]
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
         if not found and solution.gain(quantity.part) - other.gain(second.part) < _AS_GOOD:
             alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
-    inconsistent = [_inconsistency(quantity, together, certainty, effects)
-                    for quantity, certainty in found]
+    inconsistent = [
+        _inconsistency(quantity, together, certainty, effects) for quantity, certainty in found
+    ]
     return [inconsistent[0]._replace(alternative=alternative)] if len(found) == 1 else inconsistent
 
 
-def _ranked(quantities: Sequence[Quantity], selected: NDArray[np.bool_], estimated: Calibration,
-            configured: Configured) -> list[tuple[Quantity, _Solution]]:
+def _ranked(
+    quantities: Sequence[Quantity],
+    selected: NDArray[np.bool_],
+    estimated: Calibration,
+    configured: Configured,
+) -> list[tuple[Quantity, _Solution]]:
     """Hypotheses that free one more quantity each; the one that gains most in chi-square first."""
-    return sorted(((quantity, _solved(selected | _parts_of(quantity), estimated, configured))
-                   for quantity in quantities), key=lambda item: -item[1].gain(item[0].part))
+    return sorted(
+        (
+            (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
+            for quantity in quantities
+        ),
+        key=lambda item: -item[1].gain(item[0].part),
+    )
 
 
 def likely(estimated: Calibration, configured: Configured) -> Array:
@@ -151,11 +166,15 @@ def likely(estimated: Calibration, configured: Configured) -> Array:
 
     Far from an error of the times, pairs show little of it: they are linearised there, to see.
     """
-    quantity, solution = _ranked([one for one in findings.QUANTITIES if one.tracking],
-                                 np.zeros(findings.DEVIATIONS, dtype=bool), estimated,
-                                 configured)[0]
-    return np.where(_parts_of(quantity) & (solution.certainty(quantity.part) > _LIKELY),
-                    solution.off, 0.0)
+    quantity, solution = _ranked(
+        [one for one in findings.QUANTITIES if one.tracking],
+        np.zeros(findings.DEVIATIONS, dtype=bool),
+        estimated,
+        configured,
+    )[0]
+    return np.where(
+        _parts_of(quantity) & (solution.certainty(quantity.part) > _LIKELY), solution.off, 0.0
+    )
 
 
 def undetermined(estimated: Calibration, configured: Configured) -> Array:
@@ -176,11 +195,13 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
         if not known[part].any():
             solution = _solved(_parts_of(quantity), estimated, configured)
             covariance = np.ascontiguousarray(solution.covariance[part, part])
-            gain = min(float(solution.off[part] @ inverse(covariance) @ solution.off[part]),
-                       _LARGEST_GAIN)
+            gain = min(
+                float(solution.off[part] @ inverse(covariance) @ solution.off[part]), _LARGEST_GAIN
+            )
             of_prior = -2.0 * float(np.log(PRIOR_SIGMA[part]).sum())
             odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(
-                findings.QUANTITIES)
+                findings.QUANTITIES
+            )
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[findings.BIAS] = within[:, findings.BIAS] = 0.0
@@ -197,24 +218,28 @@ def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
 class _Solution(NamedTuple):
     """Deviations that fit the pairs, if some are free."""
 
-    off: Array   # (11,) from the active values
-    covariance: Array   # (11, 11)
+    off: Array  # (11,) from the active values
+    covariance: Array  # (11, 11)
     estimated: Calibration
-    active: Array   # (11,)
+    active: Array  # (11,)
 
     @property
     def by_pair(self) -> Array:
         """(N, 11) part of each pair in the error of `off`, with common errors."""
         estimated = self.estimated
         scores = estimated.b - estimated.S @ (self.active + self.off)
-        return scores @ self.covariance * (
-            math.sqrt(estimated.widened / estimated.shared) / estimated.scatter)
+        return (
+            scores
+            @ self.covariance
+            * (math.sqrt(estimated.widened / estimated.shared) / estimated.scatter)
+        )
 
     @property
     def sigma(self) -> Array:
         """(11,) 1 sigma, at least as the parts of the pairs scatter."""
-        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance),
-                                             (self.by_pair**2).sum(axis=0))))
+        return np.asarray(
+            np.sqrt(np.maximum(np.diag(self.covariance), (self.by_pair**2).sum(axis=0)))
+        )
 
     @property
     def moment(self) -> Array:
@@ -234,7 +259,7 @@ class _Solution(NamedTuple):
     def certainty(self, part: slice) -> float:
         """Some deviations in sigmas, as the parts of the pairs scatter in their direction."""
         along, gain = self._along(part), max(self.gain(part), 0.0)
-        scattered = float(((self.by_pair[:, part] @ along)**2).sum())
+        scattered = float(((self.by_pair[:, part] @ along) ** 2).sum())
         return math.sqrt(gain * min(gain / max(scattered, 1e-12), 1.0))
 
 
@@ -243,8 +268,9 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
     if free[findings.DISTORTION]:
         factors = estimated.if_distorted
-        estimated = replace(estimated, S=factors[:, None, None] * estimated.S,
-                            b=factors[:, None] * estimated.b)
+        estimated = replace(
+            estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
+        )
     S, misfit = estimated.S.sum(axis=0), estimated.scatter * estimated.shared
     # Scaled: the deviations have different units.
     scale = np.outer(sigmas, sigmas)
@@ -253,30 +279,46 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     return _Solution(off, covariance, estimated, active)
 
 
-def _inconsistency(quantity: Quantity, solution: _Solution, certainty: float,
-                   effects: Sequence[Effect]) -> Inconsistency:
+def _inconsistency(
+    quantity: Quantity, solution: _Solution, certainty: float, effects: Sequence[Effect]
+) -> Inconsistency:
     deviation = np.where(_parts_of(quantity), solution.off, 0.0)
     shift, claimed = (
         float(np.quantile([np.linalg.norm(effect[k] @ deviation) for effect in effects], quantile))
-        if effects else 0.0 for k, quantile in enumerate((_OBSERVABLE_IN, 0.5)))
-    step = solution.active + solution.off - solution.estimated.about   # of the linearisation
-    return Inconsistency(quantity, deviation, np.hypot(solution.sigma, _REMAINS * step), certainty,
-                         shift, claimed)
+        if effects
+        else 0.0
+        for k, quantile in enumerate((_OBSERVABLE_IN, 0.5))
+    )
+    step = solution.active + solution.off - solution.estimated.about  # of the linearisation
+    return Inconsistency(
+        quantity, deviation, np.hypot(solution.sigma, _REMAINS * step), certainty, shift, claimed
+    )
 
 
-def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tuple[Finding, ...],
-           configured: Configured) -> findings.Assessment:
+def assess(
+    estimated: Calibration,
+    inconsistent: list[Inconsistency],
+    gross: tuple[Finding, ...],
+    configured: Configured,
+) -> findings.Assessment:
     """Findings on all quantities; by `find_inconsistencies` and `gross_errors`."""
     if gross:
         # Poses of wrong axes or units do not determine the other quantities.
-        return findings.Assessment(gross + not_evaluated(
-            {finding.quantity for finding in gross}, gross[0].quantity))
+        return findings.Assessment(
+            gross + not_evaluated({finding.quantity for finding in gross}, gross[0].quantity)
+        )
     largest = max((one.shift for one in inconsistent), default=0.0)
-    faults = {one.quantity.name: one for one in inconsistent
-              if one.shift > max(_MATTERS, _TRACE * largest) and (np.abs(one.deviation) > (
-                  _AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()}
-    others = {one.alternative.quantity.name: one.alternative for one in faults.values()
-              if one.alternative is not None}
+    faults = {
+        one.quantity.name: one
+        for one in inconsistent
+        if one.shift > max(_MATTERS, _TRACE * largest)
+        and (np.abs(one.deviation) > (_AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()
+    }
+    others = {
+        one.alternative.quantity.name: one.alternative
+        for one in faults.values()
+        if one.alternative is not None
+    }
     faults |= others
     alternatives = ' or '.join(faults) if others else ''
     found: list[Finding] = []
@@ -289,65 +331,110 @@ def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tup
         elif faults:
             found.append(quantity.unknown('not evaluated while another parameter is inconsistent'))
         else:
-            found.append(_values(quantity, (estimated.c - configured.active)[part],
-                                 estimated.sigma[part], configured)[0])
+            found.append(
+                _values(
+                    quantity,
+                    (estimated.c - configured.active)[part],
+                    estimated.sigma[part],
+                    configured,
+                )[0]
+            )
     return findings.Assessment(tuple(found))
 
 
 def not_evaluated(named: set[str], wrong: str) -> tuple[Finding, ...]:
     """Findings on the quantities that are not `named`, while another one is `wrong`."""
-    return tuple(quantity.unknown(f'not evaluated while {wrong} is wrong')
-                 for quantity in findings.QUANTITIES if quantity.name not in named)
+    return tuple(
+        quantity.unknown(f'not evaluated while {wrong} is wrong')
+        for quantity in findings.QUANTITIES
+        if quantity.name not in named
+    )
 
 
-def _fault_findings(one: Inconsistency, configured: Configured,
-                    alternatives: str) -> Iterator[Finding]:
+def _fault_findings(
+    one: Inconsistency, configured: Configured, alternatives: str
+) -> Iterator[Finding]:
     """Findings on an inconsistent quantity; `alternatives`: hypotheses that fit as well."""
     quantity = one.quantity
     sure = one.claimed_shift * (1.0 - 2.0 / one.certainty)
     state = FindingState.WRONG if sure > _OUTSIDE else FindingState.SUSPECT
     consistent, setting = _values(
-        quantity, one.deviation[quantity.part],
-        np.hypot(one.sigma[quantity.part], _SELECTED * np.linalg.norm(one.deviation)), configured)
+        quantity,
+        one.deviation[quantity.part],
+        np.hypot(one.sigma[quantity.part], _SELECTED * np.linalg.norm(one.deviation)),
+        configured,
+    )
     estimated = consistent.estimated
     assert estimated is not None and consistent.sigma is not None
     found = replace(consistent, state=state)
     if quantity.name == 'readout_time' and estimated < 0.0:
         other = 'up' if configured.sensor.readout_direction == 'down' else 'down'
-        yield replace(found, quantity='readout_direction', fix=f'set readout_direction: {other}',
-                      message='rows are read in the opposite direction, in '
-                      + quantity.with_sigma(-estimated, consistent.sigma))
+        yield replace(
+            found,
+            quantity='readout_direction',
+            fix=f'set readout_direction: {other}',
+            message='rows are read in the opposite direction, in '
+            + quantity.with_sigma(-estimated, consistent.sigma),
+        )
         return
     fix = quantity.fix.format(setting)
     # Tracking, if it is off, starts from the parameter.
-    if quantity.tracking and not getattr(configured.sensor, quantity.tracking) and (
-            abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach):
+    if (
+        quantity.tracking
+        and not getattr(configured.sensor, quantity.tracking)
+        and (abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach)
+    ):
         fix += f', or {quantity.tracking}: true'
-    if quantity.name == 'time_offset':   # another stamped row may be equivalent
+    if quantity.name == 'time_offset':  # another stamped row may be equivalent
         camera, sigma = configured.camera, one.sigma[findings.OFFSET]
-        rows = [row for row in REFERENCE_ROWS if row != camera.reference_row and abs(
-            one.deviation[findings.OFFSET] - camera.line_delay * (
-                camera.reference_row_index
-                - replace(camera, reference_row=row).reference_row_index)) < 2.0 * sigma]
+        rows = [
+            row
+            for row in REFERENCE_ROWS
+            if row != camera.reference_row
+            and abs(
+                one.deviation[findings.OFFSET]
+                - camera.line_delay
+                * (
+                    camera.reference_row_index
+                    - replace(camera, reference_row=row).reference_row_index
+                )
+            )
+            < 2.0 * sigma
+        ]
         fix += f' (stamp_row: {rows[0]} is equivalent)' if rows else ''
     if alternatives:
         fix += f' (ambiguous: {alternatives})'
-    yield replace(found, fix=fix,
-                  message=f'{found.message} (shifts the pose by {one.shift:.1f} sigmas)')
-    if quantity.name == 'distortion' and found.configured and (
-            abs(estimated) < _LITTLE_OF * abs(found.configured)):
-        yield _fault('image_geometry', 'hardly any distortion left in the images: they may be '
-                     'rectified', 'subscribe to the original images', state)
+    yield replace(
+        found, fix=fix, message=f'{found.message} (shifts the pose by {one.shift:.1f} sigmas)'
+    )
+    if (
+        quantity.name == 'distortion'
+        and found.configured
+        and (abs(estimated) < _LITTLE_OF * abs(found.configured))
+    ):
+        yield _fault(
+            'image_geometry',
+            'hardly any distortion left in the images: they may be rectified',
+            'subscribe to the original images',
+            state,
+        )
 
 
-def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingState.WRONG,
-           configured: float | None = None, estimated: float | None = None,
-           unit: str = '') -> Finding:
+def _fault(
+    quantity: str,
+    message: str,
+    fix: str,
+    state: FindingState = FindingState.WRONG,
+    configured: float | None = None,
+    estimated: float | None = None,
+    unit: str = '',
+) -> Finding:
     return Finding(quantity, state, message, fix, configured, estimated, None, unit, True)
 
 
-def _values(quantity: Quantity, left: Array, sigmas: Array,
-            configured: Configured) -> tuple[Finding, object]:
+def _values(
+    quantity: Quantity, left: Array, sigmas: Array, configured: Configured
+) -> tuple[Finding, object]:
     """A consistent finding with the values of a quantity, and the value to set.
 
     `left`: deviation from the active values; of a vector, the most certain component is reported.
@@ -355,43 +442,67 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
     camera, sensor = configured.camera, configured.sensor
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma, setting = float(sigmas[worst]), None
-    values: dict[str, ArrayLike] = {   # active ones, in the unit of the quantity
-        'axes': 0.0, 'time_offset': sensor.time_offset + float(configured.active[findings.OFFSET]),
+    values: dict[str, ArrayLike] = {  # active ones, in the unit of the quantity
+        'axes': 0.0,
+        'time_offset': sensor.time_offset + float(configured.active[findings.OFFSET]),
         'readout_time': camera.readout_time,
-        'gyro_bias': configured.gyro_bias + configured.active[findings.BIAS], 'gyro_scale': 1.0,
-        'focal_length': camera.fx, 'distortion': (*camera.distortion, 0.0)[0]}
+        'gyro_bias': configured.gyro_bias + configured.active[findings.BIAS],
+        'gyro_scale': 1.0,
+        'focal_length': camera.fx,
+        'distortion': (*camera.distortion, 0.0)[0],
+    }
     active = np.atleast_1d(np.asarray(values[quantity.name], dtype=np.float64))
     estimated = active + left
     if quantity.name == 'axes':
         estimated = np.degrees([float(np.linalg.norm(left))])
         sigma *= math.degrees(1.0)
         setting = findings.rounded(
-            Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat())
-    elif quantity.name == 'readout_time':   # the deviation is that of the signed one
+            Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat()
+        )
+    elif quantity.name == 'readout_time':  # the deviation is that of the signed one
         estimated = active + configured.direction * left
     elif quantity.name == 'gyro_bias':
         setting = findings.rounded(estimated)
-    elif quantity.name == 'focal_length':   # the deviation is that of its inverse
+    elif quantity.name == 'focal_length':  # the deviation is that of its inverse
         estimated = active / (1.0 + left)
         sigma *= float(estimated[0])
     component = worst if len(active) > 1 else 0
     value = float(estimated[component])
-    return Finding(quantity.name, FindingState.OK, quantity.compared(estimated, sigma, active), '',
-                   float(active[component]), value, sigma, quantity.unit,
-                   True), value if setting is None else setting
+    return Finding(
+        quantity.name,
+        FindingState.OK,
+        quantity.compared(estimated, sigma, active),
+        '',
+        float(active[component]),
+        value,
+        sigma,
+        quantity.unit,
+        True,
+    ), value if setting is None else setting
 
 
-def gross_errors(rotations: RotationComparison | None, ahead: float, configured: Configured,
-                 before: tuple[Finding, ...] = ()) -> tuple[Finding, ...]:
+def gross_errors(
+    rotations: RotationComparison | None,
+    ahead: float,
+    configured: Configured,
+    before: tuple[Finding, ...] = (),
+) -> tuple[Finding, ...]:
     """Axes, unit, flips, clocks (`ahead` [s]); those `before` until they are contradicted."""
     if rotations is None:
         return before
     if rotations.left_as_configured < _EXPLAINED_AT_BEST and (
-            1.0 < rotations.scale * _UNIT_FACTOR < _UNIT_FACTOR**2):
+        1.0 < rotations.scale * _UNIT_FACTOR < _UNIT_FACTOR**2
+    ):
         return tuple(_rotation_errors(rotations, configured))
     if apart := clocks_apart(ahead):
-        return _fault('time_offset', apart, 'stamp both by one clock, or set time_offset: '
-                      f'{configured.sensor.time_offset + ahead:.2f} if they differ by a constant'),
+        return (
+            _fault(
+                'time_offset',
+                apart,
+                'stamp both by one clock, or set time_offset: '
+                f'{configured.sensor.time_offset + ahead:.2f} if they differ by a constant',
+            ),
+        )
     found = tuple(_rotation_errors(rotations, configured))
     # Any error may leave images and gyro independent for a while, if frames are lost.
     certain = found and (not before or found[0].quantity != _INDEPENDENT_OF[0])
@@ -407,18 +518,27 @@ def _rotation_errors(rotations: RotationComparison, configured: Configured) -> I
     explained = min(rotations.left_at_best, rotations.left_mirrored)
     if explained < _EXPLAINED_AT_BEST:
         if rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR:
-            yield _fault('gyro_unit', f'images rotate {rotations.scale:.3g} times as far as the '
-                         'gyro', 'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
-                         configured=1.0, estimated=rotations.scale)
+            yield _fault(
+                'gyro_unit',
+                f'images rotate {rotations.scale:.3g} times as far as the gyro',
+                'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
+                configured=1.0,
+                estimated=rotations.scale,
+            )
         if rotations.is_left_handed or rotations.is_turned:
             yield from _wrong_axes(rotations, configured)
-    elif rotations.by_gyro > _LONG_ROTATION and min(
-            explained, rotations.left_of_all) > _INDEPENDENT:
+    elif (
+        rotations.by_gyro > _LONG_ROTATION and min(explained, rotations.left_of_all) > _INDEPENDENT
+    ):
         # Of a constant rate only noise is left once it is removed.
         for name in _INDEPENDENT_OF:
-            yield _fault(name, 'images and gyro rotate independently of each other', 'verify that '
-                         'the IMU is that of this camera, that both stamp by one clock, and that '
-                         'electronic stabilisation is off')
+            yield _fault(
+                name,
+                'images and gyro rotate independently of each other',
+                'verify that '
+                'the IMU is that of this camera, that both stamp by one clock, and that '
+                'electronic stabilisation is off',
+            )
 
 
 def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:
@@ -427,25 +547,41 @@ def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterat
         # Usually a single sign in the axes of the IMU itself.
         signs = np.diag(R_cam_imu.T @ rotations.reflection @ R_cam_imu)
         axis = 'xyz'[int(np.argmin(signs))] if sorted(signs)[1] > 0.7 > -0.7 > min(signs) else ''
-        yield _fault('axes', 'the axes of the gyro are left-handed: '
-                     + (f'wrong sign of {axis}' if axis else 'wrong sign of one or of all axes'),
-                     'correct the driver (no quat_cam_imu_xyzw corrects a sign)')
+        yield _fault(
+            'axes',
+            'the axes of the gyro are left-handed: '
+            + (f'wrong sign of {axis}' if axis else 'wrong sign of one or of all axes'),
+            'correct the driver (no quat_cam_imu_xyzw corrects a sign)',
+        )
         return
     angle, Q = rotations.angle, rotations.rotation
     xyzw = findings.rounded(Rotation.from_matrix(Q @ R_cam_imu).as_quat(), 3)
-    yield _fault('axes', f'rotation axes of the images are {math.degrees(angle):.0f} deg from '
-                 f'those of the gyro by quat_cam_imu_xyzw; about {xyzw} fits', 'refine it with '
-                 '"rs_relpose calibrate" (a static transform with parent imu holds the inverse)',
-                 configured=0.0, estimated=math.degrees(angle), unit='deg')
+    yield _fault(
+        'axes',
+        f'rotation axes of the images are {math.degrees(angle):.0f} deg from '
+        f'those of the gyro by quat_cam_imu_xyzw; about {xyzw} fits',
+        'refine it with '
+        '"rs_relpose calibrate" (a static transform with parent imu holds the inverse)',
+        configured=0.0,
+        estimated=math.degrees(angle),
+        unit='deg',
+    )
     about_view = float(log_so3(Q)[2])
     if abs(abs(about_view) - 0.5 * math.pi) < _QUARTER_TURN > angle - abs(about_view):
-        yield _fault('image_geometry', 'alternatively, the images are rotated by 90 deg '
-                     + ('clockwise' if about_view > 0.0 else 'counterclockwise'), 'publish them '
-                     'as the sensor provides them, with its CameraInfo: no other has rows that '
-                     'are read one by one')
+        yield _fault(
+            'image_geometry',
+            'alternatively, the images are rotated by 90 deg '
+            + ('clockwise' if about_view > 0.0 else 'counterclockwise'),
+            'publish them '
+            'as the sensor provides them, with its CameraInfo: no other has rows that '
+            'are read one by one',
+        )
     if abs(angle - math.pi) < _HALF_TURN:
         axis_of = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
         if float(axis_of.max()) > math.cos(_HALF_TURN):
             flip = 'upside down' if axis_of[2] == axis_of.max() else 'mirrored'
-            yield _fault('image_geometry', f'alternatively, the images are {flip}',
-                         'publish them as the sensor provides them')
+            yield _fault(
+                'image_geometry',
+                f'alternatively, the images are {flip}',
+                'publish them as the sensor provides them',
+            )

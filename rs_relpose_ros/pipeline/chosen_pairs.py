@@ -21,8 +21,9 @@ from rs_relpose_ros.pipeline.pipeline import Processor
 from rs_relpose_ros.tracking.features import DescriptorTracker
 
 
-def view_frame(frame: Frame[Any], imu: ImuBuffer, parameters: Parameters,
-               since: Frame[Any] | None = None) -> Frame[Any]:
+def view_frame(
+    frame: Frame[Any], imu: ImuBuffer, parameters: Parameters, since: Frame[Any] | None = None
+) -> Frame[Any]:
     """A frame with its IMU data, to be related to others by `estimate_wide_pair`.
 
     Parameters
@@ -46,14 +47,25 @@ def view_frame(frame: Frame[Any], imu: ImuBuffer, parameters: Parameters,
         The gyro does not cover the frame.
     """
     clock = sensor_model(frame.intrinsics, parameters.sensor).clock
-    return replace(frame, imu_data=frame_imu(
-        imu, clock.exposed_span_ns(frame.stamp_ns), clock.reference_ns(frame.stamp_ns),
-        parameters.sensor.R_cam_imu, None if since is None else since.imu.reference_ns,
-        clock.exposure()))
+    return replace(
+        frame,
+        imu_data=frame_imu(
+            imu,
+            clock.exposed_span_ns(frame.stamp_ns),
+            clock.reference_ns(frame.stamp_ns),
+            parameters.sensor.R_cam_imu,
+            None if since is None else since.imu.reference_ns,
+            clock.exposure(),
+        ),
+    )
 
 
-def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parameters,
-                       between: Sequence[Frame[Any]] = ()) -> PairResult:
+def estimate_wide_pair(
+    first: Frame[Any],
+    second: Frame[Any],
+    parameters: Parameters,
+    between: Sequence[Frame[Any]] = (),
+) -> PairResult:
     """The relative pose of two frames, matched by descriptors.
 
     Parameters
@@ -79,18 +91,23 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     if second.stamp_ns <= first.stamp_ns:
         raise InputError('the second frame must be later than the first: exchange them')
     if second.intrinsics != first.intrinsics:
-        raise InputError('the intrinsics changed between the two frames: one calibration must '
-                         'hold for both')
+        raise InputError(
+            'the intrinsics changed between the two frames: one calibration must hold for both'
+        )
     sensor = sensor_model(first.intrinsics, parameters.sensor)
-    tracking = parameters.tracking   # KLT has no descriptors
-    tracker = DescriptorTracker(replace(tracking, detector='sift') if tracking.detector == 'klt'
-                                else tracking)
+    tracking = parameters.tracking  # KLT has no descriptors
+    tracker = DescriptorTracker(
+        replace(tracking, detector='sift') if tracking.detector == 'klt' else tracking
+    )
     tracker.start(first.image)
     gyro = _gyro(first, second, parameters)
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
-    inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters) if near else (
-        'the frames are further apart than max_keyframe_interval')
+    inertial = (
+        pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
+        if near
+        else ('the frames are further apart than max_keyframe_interval')
+    )
     history = TrackHistory(first.imu)
     if gyro is not None and near:
         for frame in used_frames(between):
@@ -101,13 +118,21 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     if gyro is not None:
         history.add(second.imu, gyro, matches)
     pose = pair.estimate_pair(
-        first.imu, second.imu, (first.stamp_ns, second.stamp_ns), matches, sensor, gyro, inertial,
+        first.imu,
+        second.imu,
+        (first.stamp_ns, second.stamp_ns),
+        matches,
+        sensor,
+        gyro,
+        inertial,
         parameters,
         interval=interval if near else None,
-        between=() if gyro is None else history.between(matches, sensor, second.imu, inertial))
+        between=() if gyro is None else history.between(matches, sensor, second.imu, inertial),
+    )
     rays1, rays2 = (
         pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
-        for points, frame in ((matches.points1, first), (matches.points2, second)))
+        for points, frame in ((matches.points1, first), (matches.points2, second))
+    )
     return pair.pair_result(first, second, matches, rays1, rays2, pose, gyro, sensor, parameters)
 
 
@@ -135,7 +160,7 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         self._last: dict[int, int] = {}
         for first_ns, second_ns in self._wanted:
             self._last[first_ns] = max(second_ns, self._last.get(first_ns, second_ns))
-        self._frames: dict[int, Frame[Any]] = {}   # by stamp
+        self._frames: dict[int, Frame[Any]] = {}  # by stamp
         self._recent: dict[int, Frame[Any]] = {}
         self._imus: dict[int, FrameImu] = {}
 
@@ -145,37 +170,62 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         self._recent.clear()
         self._imus.clear()
 
-    def process(self, frame: Frame[Any],
-                parameters: Parameters) -> dict[Stamps, PairResult | str] | None:
+    def process(
+        self, frame: Frame[Any], parameters: Parameters
+    ) -> dict[Stamps, PairResult | str] | None:
         """The pairs of this frame with earlier ones."""
         current_ns = frame.stamp_ns
         self._imus[current_ns] = frame.imu
-        pairs = {(first_ns, current_ns): self._pair(first_ns, frame, parameters)
-                 for first_ns in self._frames if (first_ns, current_ns) in self._wanted}
+        pairs = {
+            (first_ns, current_ns): self._pair(first_ns, frame, parameters)
+            for first_ns in self._frames
+            if (first_ns, current_ns) in self._wanted
+        }
         self._frames[current_ns] = frame
-        self._frames = {stamp_ns: one for stamp_ns, one in self._frames.items()
-                        if self._last.get(stamp_ns, 0) > current_ns}
+        self._frames = {
+            stamp_ns: one
+            for stamp_ns, one in self._frames.items()
+            if self._last.get(stamp_ns, 0) > current_ns
+        }
         oldest_ns = min(self._frames, default=current_ns)
         longest_ns = to_nanoseconds(parameters.keyframes.max_keyframe_interval)
-        first_ns = min((stamp_ns for stamp_ns in self._frames
-                        if stamp_ns > current_ns - longest_ns), default=current_ns)
-        self._recent = {stamp_ns: one for stamp_ns, one in
-                        (*self._recent.items(), (current_ns, frame)) if stamp_ns > first_ns}
-        self._imus = {stamp_ns: one for stamp_ns, one in self._imus.items()
-                      if stamp_ns > oldest_ns}
+        first_ns = min(
+            (stamp_ns for stamp_ns in self._frames if stamp_ns > current_ns - longest_ns),
+            default=current_ns,
+        )
+        self._recent = {
+            stamp_ns: one
+            for stamp_ns, one in (*self._recent.items(), (current_ns, frame))
+            if stamp_ns > first_ns
+        }
+        self._imus = {
+            stamp_ns: one for stamp_ns, one in self._imus.items() if stamp_ns > oldest_ns
+        }
         return pairs or None
 
     def _pair(self, first_ns: int, second: Frame[Any], parameters: Parameters) -> PairResult | str:
         """Of an earlier frame and the current one."""
+
         def since_first(frame: Frame[Any]) -> Frame[Any]:
-            return replace(frame, imu_data=reduce(pair.joined, [
-                imu for stamp_ns, imu in self._imus.items()
-                if first_ns < stamp_ns <= frame.stamp_ns]))
+            return replace(
+                frame,
+                imu_data=reduce(
+                    pair.joined,
+                    [
+                        imu
+                        for stamp_ns, imu in self._imus.items()
+                        if first_ns < stamp_ns <= frame.stamp_ns
+                    ],
+                ),
+            )
 
         between = [frame for stamp_ns, frame in self._recent.items() if stamp_ns > first_ns]
         try:
             return estimate_wide_pair(
-                self._frames[first_ns], since_first(second), parameters,
-                [since_first(frame) for frame in used_frames(between)])
+                self._frames[first_ns],
+                since_first(second),
+                parameters,
+                [since_first(frame) for frame in used_frames(between)],
+            )
         except RsRelposeError as error:
             return str(error)

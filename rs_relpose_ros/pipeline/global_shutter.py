@@ -46,20 +46,25 @@ _NO_POSE = RelativePose(Status.TOO_FEW_MATCHES, 'no pair')
 class RowMap(NamedTuple):
     """A map for one motion, as its nodes."""
 
-    nodes: NDArray[np.float32]   # (rows, columns, 2) original pixels, NaN outside of the lens
-    width: int   # of the image
+    nodes: NDArray[np.float32]  # (rows, columns, 2) original pixels, NaN outside of the lens
+    width: int  # of the image
     height: int
-    shift: float   # [px] largest difference of a coordinate of a node and its source
+    shift: float  # [px] largest difference of a coordinate of a node and its source
 
     def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
         """Bands of rows, which fit into a cache, and sources (N, W, 2) for `cv2.remap`."""
         for top in range(0, self.height, _BAND):
             bottom = min(top + _BAND, self.height)
-            nodes = self.nodes[top // _STEP:math.ceil(bottom / _STEP) + 2]
-            band = cv2.resize(nodes, (nodes.shape[1] * _STEP, nodes.shape[0] * _STEP),
-                              interpolation=cv2.INTER_LINEAR)
-            yield slice(top, bottom), np.asarray(
-                band[_STEP:_STEP + bottom - top, _STEP:_STEP + self.width])
+            nodes = self.nodes[top // _STEP : math.ceil(bottom / _STEP) + 2]
+            band = cv2.resize(
+                nodes,
+                (nodes.shape[1] * _STEP, nodes.shape[0] * _STEP),
+                interpolation=cv2.INTER_LINEAR,
+            )
+            yield (
+                slice(top, bottom),
+                np.asarray(band[_STEP : _STEP + bottom - top, _STEP : _STEP + self.width]),
+            )
 
 
 class MiddleRow:
@@ -71,13 +76,14 @@ class MiddleRow:
         sizes = intrinsics.image_height, intrinsics.image_width
         # cv2.resize puts node k at pixel (k + 1/2) step - 1/2; one node more on each side, so that
         # all pixels lie between nodes.
-        down, across = ((np.arange(math.ceil(size / _STEP) + 2) - 0.5) * _STEP - 0.5
-                        for size in sizes)
+        down, across = (
+            (np.arange(math.ceil(size / _STEP) + 2) - 0.5) * _STEP - 0.5 for size in sizes
+        )
         self._shape = len(down), len(across)
         self._nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
         pixels = intrinsics.to_sensor(self._nodes)
         self._rays = camera.unproject(pixels)
-        self._rows = np.ascontiguousarray(pixels[:, 1])   # of the sensor
+        self._rows = np.ascontiguousarray(pixels[:, 1])  # of the sensor
         _, middle = intrinsics.to_sensor([[0.0, 0.5 * (sizes[0] - 1)]])[0]
         self.delay = float(camera.row_times(middle))
 
@@ -86,12 +92,19 @@ class MiddleRow:
         camera, intrinsics = self.sensor.camera, self.sensor.intrinsics
         # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
         rows = np.linspace(0.0, camera.height - 1.0, _ORIENTATIONS)
-        turns = np.einsum('nji,jk->nik', motion.rotations(camera.row_times(rows)),
-                          motion.rotations([self.delay])[0])
+        turns = np.einsum(
+            'nji,jk->nik',
+            motion.rotations(camera.row_times(rows)),
+            motion.rotations([self.delay])[0],
+        )
         nodes = intrinsics.to_image(camera.project_rotating(self._rays, self._rows, turns))
         shift = np.nanmax(np.abs(nodes - self._nodes), initial=0.0)
-        return RowMap(nodes.reshape(*self._shape, 2).astype(np.float32), intrinsics.image_width,
-                      intrinsics.image_height, float(shift))
+        return RowMap(
+            nodes.reshape(*self._shape, 2).astype(np.float32),
+            intrinsics.image_width,
+            intrinsics.image_height,
+            float(shift),
+        )
 
 
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
@@ -101,17 +114,17 @@ _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 class GlobalShutterFrame:
     """A frame as of a global shutter at the time of the middle row."""
 
-    stamp_ns: int   # time of the middle row, on the clock of the parameter stamp_clock
+    stamp_ns: int  # time of the middle row, on the clock of the parameter stamp_clock
     original: Pixels
-    original_stamp_ns: int   # of its header
+    original_stamp_ns: int  # of its header
     frame_id: str
     intrinsics: Intrinsics
-    is_png: bool   # whether the original came as a PNG
+    is_png: bool  # whether the original came as a PNG
     middle: MiddleRow
     motion: FrameMotion
-    border: str   # of `_BORDERS`
-    applied_offset_ns: int   # tracked time offset in the stamp, beyond the parameter's
-    health: Assessment   # by the frames before, if they are watched or tracked
+    border: str  # of `_BORDERS`
+    applied_offset_ns: int  # tracked time offset in the stamp, beyond the parameter's
+    health: Assessment  # by the frames before, if they are watched or tracked
 
     @cached_property
     def map(self) -> RowMap:
@@ -124,8 +137,13 @@ class GlobalShutterFrame:
         has_holes, derotated = np.isnan(self.map.nodes).any(), np.empty_like(values)
         for rows, sources in self.map.bands():
             # None, as the types forbid: OpenCV 5 takes an empty second map for one.
-            derotated[rows] = cv2.remap(values, sources, None,  # type: ignore[call-overload]
-                                        cv2.INTER_LINEAR, borderMode=border)
+            derotated[rows] = cv2.remap(
+                values,
+                sources,
+                None,  # type: ignore[call-overload]
+                cv2.INTER_LINEAR,
+                borderMode=border,
+            )
             if has_holes:
                 derotated[rows][np.isnan(sources[..., 0])] = 0
         return Pixels(derotated, self.original.encoding)
@@ -136,8 +154,9 @@ class GlobalShutterFrame:
         mask = np.empty((height, width), dtype=np.uint8)
         for rows, sources in self.map.bands():
             u, v = sources[..., 0], sources[..., 1]
-            mask[rows] = np.where((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0)
-                                  & (v <= height - 1.0), 255, 0)
+            mask[rows] = np.where(
+                (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0), 255, 0
+            )
         return Pixels(mask, 'mono8')
 
 
@@ -151,7 +170,7 @@ class Unroller(Processor[GlobalShutterFrame]):
     def __init__(self, watched: Callable[[], bool] = lambda: False) -> None:
         self._follower: Pipeline | RotationWatch = RotationWatch()
         self._watched, self._levels = watched, GrayLevels()
-        self._due: tuple[Frame[Any], Parameters] | None = None   # for the follower
+        self._due: tuple[Frame[Any], Parameters] | None = None  # for the follower
         self._middle: MiddleRow | None = None
 
     def prepare(self) -> None:
@@ -165,8 +184,15 @@ class Unroller(Processor[GlobalShutterFrame]):
         elif isinstance(follower, Pipeline) or follower.needs(frame):
             assert frame.encoded is not None
             # The gray image of relpose_node, bit by bit.
-            follower.process(replace(frame, image=frame.encoded.decoded(self._levels),
-                                     encoded=None, encoding='mono8'), parameters)
+            follower.process(
+                replace(
+                    frame,
+                    image=frame.encoded.decoded(self._levels),
+                    encoded=None,
+                    encoding='mono8',
+                ),
+                parameters,
+            )
             self.applied = follower.applied
 
     def reset(self) -> None:
@@ -178,7 +204,8 @@ class Unroller(Processor[GlobalShutterFrame]):
         """Whether no pipeline works on the next frame."""
         sensor = parameters.sensor
         return isinstance(self._follower, RotationWatch) and not (
-            sensor.track_time_offset or sensor.track_readout_time)
+            sensor.track_time_offset or sensor.track_readout_time
+        )
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> GlobalShutterFrame:
         """The derotated frame."""
@@ -195,13 +222,21 @@ class Unroller(Processor[GlobalShutterFrame]):
         reference_ns = imu.reference_ns
         if parameters.global_shutter.stamp_clock == 'camera':
             reference_ns = frame.stamp_ns + to_nanoseconds(
-                timing.exposure_shift(sensor.stamp_exposure, imu.exposure)
-                + model.pose_row_delay)
+                timing.exposure_shift(sensor.stamp_exposure, imu.exposure) + model.pose_row_delay
+            )
         return GlobalShutterFrame(
             reference_ns + to_nanoseconds(self._middle.delay),
-            Pixels(frame.image, frame.encoding), frame.stamp_ns, frame.frame_id, frame.intrinsics,
-            frame.encoded.is_png, self._middle, imu.motion, parameters.global_shutter.border,
-            imu.applied_offset_ns, self._follower.health)
+            Pixels(frame.image, frame.encoding),
+            frame.stamp_ns,
+            frame.frame_id,
+            frame.intrinsics,
+            frame.encoded.is_png,
+            self._middle,
+            imu.motion,
+            parameters.global_shutter.border,
+            imu.applied_offset_ns,
+            self._follower.health,
+        )
 
 
 # Time from one comparison to the next [ns].
@@ -237,8 +272,12 @@ class RotationWatch(Processor[None]):
         """Follow points into a frame."""
         self._monitor.ahead.append(frame.imu.ahead)
         begin = self._begin
-        if (self._tracker is None or begin is None or frame.imu.since_previous is None
-                or frame.intrinsics != begin.intrinsics):
+        if (
+            self._tracker is None
+            or begin is None
+            or frame.imu.since_previous is None
+            or frame.intrinsics != begin.intrinsics
+        ):
             self._tracker = self._tracker or make_tracker(parameters.tracking)
             self._tracker.reset()
             self._tracker.start(frame.image)
@@ -247,21 +286,38 @@ class RotationWatch(Processor[None]):
         # Not predicted by the gyro, which may be wrong.
         matches = self._tracker.track(frame.image)
         camera = sensor_model(frame.intrinsics, parameters.sensor).camera
-        by_images = rotation_of_rays(*(camera.unproject(frame.intrinsics.to_sensor(points))
-                                       for points in (matches.points1, matches.points2)))
+        by_images = rotation_of_rays(
+            *(
+                camera.unproject(frame.intrinsics.to_sensor(points))
+                for points in (matches.points1, matches.points2)
+            )
+        )
         if by_images is not None:
             self._monitor.rotations.add(
-                frame.stamp_ns, timing.seconds_between(begin.stamp_ns, frame.stamp_ns), by_images,
-                log_so3(GyroRotation.of(frame.imu, parameters.imu).rotation))
-        self._monitor.add_pair(frame.stamp_ns, None, _NO_POSE, Configured(
-            parameters.sensor, camera, np.array(parameters.imu.gyro_bias),
-            np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)))
+                frame.stamp_ns,
+                timing.seconds_between(begin.stamp_ns, frame.stamp_ns),
+                by_images,
+                log_so3(GyroRotation.of(frame.imu, parameters.imu).rotation),
+            )
+        self._monitor.add_pair(
+            frame.stamp_ns,
+            None,
+            _NO_POSE,
+            Configured(
+                parameters.sensor,
+                camera,
+                np.array(parameters.imu.gyro_bias),
+                np.zeros(DEVIATIONS),
+                np.zeros(DEVIATIONS),
+            ),
+        )
         self._monitor.assess()
         self.reset()
 
 
-def unrolling_loop(parameters: Parameters, *, offline: bool = False,
-                   watched: Callable[[], bool] = lambda: False) -> FrameLoop[GlobalShutterFrame]:
+def unrolling_loop(
+    parameters: Parameters, *, offline: bool = False, watched: Callable[[], bool] = lambda: False
+) -> FrameLoop[GlobalShutterFrame]:
     """The loop that derotates frames; `watched` is that of `Unroller`."""
     return FrameLoop(parameters, Unroller(watched), offline=offline, colors=True)
 
@@ -271,8 +327,9 @@ def warm_up_unroller(parameters: Parameters) -> None:
     sensor = parameters.sensor
     if sensor.track_time_offset or sensor.track_readout_time:
         warm_up_pipeline(parameters)
-    parameters = parameters.updated({
-        **MADE_UP_SENSOR, 'track_time_offset': False, 'track_readout_time': False})
+    parameters = parameters.updated(
+        {**MADE_UP_SENSOR, 'track_time_offset': False, 'track_readout_time': False}
+    )
     for frame in made_up_frames(unrolling_loop(parameters, offline=True, watched=lambda: True)):
         assert frame.result is not None
         frame.result.image()

@@ -42,14 +42,14 @@ class ConsistencyMonitor:
         self.agreement = Agreement()
         self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
-        self.latest: recursion.PairInformation | None = None   # of the last pair
+        self.latest: recursion.PairInformation | None = None  # of the last pair
         self._inconsistent: list[Inconsistency] = []
-        self._likely = np.zeros(DEVIATIONS)   # about which pairs are linearised
-        self._undetermined: Array | None = None   # by the pairs before
+        self._likely = np.zeros(DEVIATIONS)  # about which pairs are linearised
+        self._undetermined: Array | None = None  # by the pairs before
         self._gross: tuple[Finding, ...] = ()
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
-        self._wrong_configuration = False   # by the last pair
+        self._wrong_configuration = False  # by the last pair
         # The last pair until it is assessed.
         self._due: tuple[recursion.PairInformation | None, RelativePose, Configured] | None = None
         self.health, self.calibration = findings.NOT_EVALUATED, recursion.NOTHING_ESTIMATED
@@ -60,8 +60,13 @@ class ConsistencyMonitor:
         if not self._wrong_configuration:
             self.acceleration.add(stamp_ns, evidence)
 
-    def add_pair(self, stamp_ns: int, data: recursion.PairData | None, pose: RelativePose,
-                 configured: Configured) -> RelativePose:
+    def add_pair(
+        self,
+        stamp_ns: int,
+        data: recursion.PairData | None,
+        pose: RelativePose,
+        configured: Configured,
+    ) -> RelativePose:
         """Add a pair; the pose with a covariance consistent with all pairs so far.
 
         `data` is None if the pair has no rotation or no gyro. `assess` completes it.
@@ -73,8 +78,11 @@ class ConsistencyMonitor:
             # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
             # off already, a little more or less may hardly move them.
             self.latest = information = self._recursion.add(
-                stamp_ns, data, configured.active, np.asarray(
-                    configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)))
+                stamp_ns,
+                data,
+                configured.active,
+                np.asarray(configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)),
+            )
             if information is None:
                 return pose
             self._due = information, pose, configured
@@ -89,13 +97,20 @@ class ConsistencyMonitor:
             self._inconsistent = []
             return pose
         # The inconsistency, deviations that the pairs so far have not excluded, and the center.
-        doubt = np.outer(shift, shift) + by_center @ by_center.T + (
-            by_deviation @ self._undetermined @ by_deviation.T)
+        doubt = (
+            np.outer(shift, shift)
+            + by_center @ by_center.T
+            + (by_deviation @ self._undetermined @ by_deviation.T)
+        )
         widened = replace(pose, covariance=pose.covariance + doubt)
         # The effect of an inconsistent parameter on the baseline is not known.
-        return widened.without_baseline(
-            'baseline not known: a configured parameter is inconsistent (see health)'
-        ) if shift.any() and pose else widened
+        return (
+            widened.without_baseline(
+                'baseline not known: a configured parameter is inconsistent (see health)'
+            )
+            if shift.any() and pose
+            else widened
+        )
 
     def assess(self) -> None:
         """Assess all quantities after the last pair, for the next one: its pose does not wait."""
@@ -109,18 +124,24 @@ class ConsistencyMonitor:
                 (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
                 # A deviation may be so large that no pair has a pose.
                 self._inconsistent = assessment.find_inconsistencies(
-                    self.calibration, self._on_poses or self._on_rotations, configured)
-                self._likely = self._deviation() if self._inconsistent else assessment.likely(
-                    self.calibration, configured)
+                    self.calibration, self._on_poses or self._on_rotations, configured
+                )
+                self._likely = (
+                    self._deviation()
+                    if self._inconsistent
+                    else assessment.likely(self.calibration, configured)
+                )
             except np.linalg.LinAlgError:
                 self._inconsistent = []
             self._undetermined = assessment.undetermined(self.calibration, configured)
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
         ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
         self._gross = assessment.gross_errors(
-            self.rotations.compared(), ahead, configured, self._gross)
-        self.health = assessment.assess(self.calibration, self._inconsistent, self._gross,
-                                        configured)
+            self.rotations.compared(), ahead, configured, self._gross
+        )
+        self.health = assessment.assess(
+            self.calibration, self._inconsistent, self._gross, configured
+        )
         self._wrong_configuration = bool(self.health.faults)
         if self._wrong_configuration:
             self.acceleration.clear()
@@ -137,17 +158,26 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
     if health.state is not findings.FindingState.WRONG or not np.isfinite(pose.R).all():
         return pose
     return RelativePose(
-        status=Status.WITHHELD, reason=health.faults[0].text,
-        inliers=pose.inliers, model=pose.model, iterations=pose.iterations,
-        residual_rms=pose.residual_rms, duration=pose.duration)
+        status=Status.WITHHELD,
+        reason=health.faults[0].text,
+        inliers=pose.inliers,
+        model=pose.model,
+        iterations=pose.iterations,
+        residual_rms=pose.residual_rms,
+        duration=pose.duration,
+    )
 
 
 def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effect:
     rows, claimed = slice(3, None), pose.covariance[3:, 3:]
-    if pose:   # t is a direction: along itself it has no variance, and nothing moves it there
+    if pose:  # t is a direction: along itself it has no variance, and nothing moves it there
         rows, claimed = slice(None), pose.covariance + np.pad(np.outer(pose.t, pose.t), (0, 3))
-    return Effect(information.shift_by_deviation[:None if pose else 3], solve_triangular(
-        np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True))
+    return Effect(
+        information.shift_by_deviation[: None if pose else 3],
+        solve_triangular(
+            np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True
+        ),
+    )
 
 
 class Agreement:
@@ -158,11 +188,12 @@ class Agreement:
     """
 
     def __init__(self) -> None:
-        self._last: tuple[int, RelativePose] | None = None   # with its second stamp
+        self._last: tuple[int, RelativePose] | None = None  # with its second stamp
         self._squares = self._freedom = 0.0
 
-    def enlarged(self, first_ns: int, second_ns: int, estimated: RelativePose,
-                 assessed: RelativePose) -> RelativePose:
+    def enlarged(
+        self, first_ns: int, second_ns: int, estimated: RelativePose, assessed: RelativePose
+    ) -> RelativePose:
         """Add a pair as estimated; the assessed pose with its covariance enlarged."""
         before, self._last = self._last, None
         if not (estimated and np.isfinite(estimated.linear_velocity1_covariance).all()):
@@ -170,13 +201,15 @@ class Agreement:
         self._last = second_ns, estimated
         if before is not None and before[0] == first_ns:
             kept = 1.0 - 1.0 / _REMEMBERED
-            self._squares = kept * self._squares + min(2.0 * _LARGEST_DISAGREEMENT,
-                                                       _disagreement(before[1], estimated))
+            self._squares = kept * self._squares + min(
+                2.0 * _LARGEST_DISAGREEMENT, _disagreement(before[1], estimated)
+            )
             self._freedom = kept * self._freedom + 2.0
         prior = 2.0 * _PRIOR_PAIRS
         # The second factor: of a rotation that contradicts the gyro, as with two views.
         factor = max((prior + self._squares) / (prior + self._freedom), 1.0) * max(
-            (1.0 + estimated.gyro_square) / 4.0, 1.0)
+            (1.0 + estimated.gyro_square) / 4.0, 1.0
+        )
         if factor == 1.0:
             return assessed
         velocities = assessed.velocity_covariance.copy()
@@ -188,9 +221,12 @@ class Agreement:
         half = solve_triangular(root, assessed.covariance + along, lower=True)
         values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
         axes = root @ vectors
-        return replace(assessed, velocity_covariance=velocities, covariance=(
-            axes * np.maximum(values, 1.0)) @ axes.T - along,
-            images=assessed.images and assessed.images.enlarged(factor))
+        return replace(
+            assessed,
+            velocity_covariance=velocities,
+            covariance=(axes * np.maximum(values, 1.0)) @ axes.T - along,
+            images=assessed.images and assessed.images.enlarged(factor),
+        )
 
 
 def _disagreement(before: RelativePose, after: RelativePose) -> float:
@@ -198,8 +234,10 @@ def _disagreement(before: RelativePose, after: RelativePose) -> float:
     lengths = np.linalg.norm([before.linear_velocity2, after.linear_velocity1], axis=1)
     across = tangent_basis(before.linear_velocity2 / lengths[0])
     apart = across.T @ after.linear_velocity1 / lengths[1]
-    spread = (before.velocity_covariance[:3, :3] / lengths[0]**2
-              + after.linear_velocity1_covariance / lengths[1]**2)
+    spread = (
+        before.velocity_covariance[:3, :3] / lengths[0] ** 2
+        + after.linear_velocity1_covariance / lengths[1] ** 2
+    )
     return float(apart @ np.linalg.solve(across.T @ spread @ across, apart))
 
 
@@ -213,11 +251,11 @@ _OFFSET_STEP, _READOUT_STEP = 1e-3, 5e-4
 class Tracked:
     """Parameters as estimated after the pairs so far."""
 
-    gyro_bias: Array   # (3,) [rad/s], IMU frame; the whole bias, not its deviation
+    gyro_bias: Array  # (3,) [rad/s], IMU frame; the whole bias, not its deviation
     gyro_bias_sigma: Array
-    time_offset: float   # [s] IMU clock minus camera clock, as the parameter of this name
+    time_offset: float  # [s] IMU clock minus camera clock, as the parameter of this name
     time_offset_sigma: float
-    readout_time: float   # [s] as the parameter; negative where rows are read the other way
+    readout_time: float  # [s] as the parameter; negative where rows are read the other way
     readout_time_sigma: float
     pairs: int
 
@@ -227,37 +265,55 @@ class Tracked:
         along = np.zeros(len(estimated.c))
         along[OFFSET], along[READOUT] = 1.0, recursion.middle_share(configured.camera)
         offset = configured.sensor.time_offset + float(along @ estimated.c)
-        signed = configured.camera.line_delay * configured.camera.height   # active
+        signed = configured.camera.line_delay * configured.camera.height  # active
         readout = signed - configured.active[READOUT] + estimated.c[READOUT]
-        return cls(configured.gyro_bias + estimated.c[BIAS], estimated.sigma[BIAS],
-                   offset - along[READOUT] * float(configured.active[READOUT]),
-                   math.sqrt(float(along @ estimated.covariance @ along)),
-                   float(readout) * configured.direction, float(estimated.sigma[READOUT]),
-                   len(estimated.b))
+        return cls(
+            configured.gyro_bias + estimated.c[BIAS],
+            estimated.sigma[BIAS],
+            offset - along[READOUT] * float(configured.active[READOUT]),
+            math.sqrt(float(along @ estimated.covariance @ along)),
+            float(readout) * configured.direction,
+            float(estimated.sigma[READOUT]),
+            len(estimated.b),
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Applied:
     """Deviations applied to the next frames, in addition to the parameters."""
 
-    time_offset: float = 0.0   # [s]
-    readout_time: float = 0.0   # [s]
+    time_offset: float = 0.0  # [s]
+    readout_time: float = 0.0  # [s]
     # [s] beyond the configured rows that the IMU must cover, too, for a longer readout time.
     margin: float = 0.0
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
         """One step towards the estimate, or back to zero if the parameter is not tracked."""
-        def stepped(tracked: bool, sigma: float, value: float, target: float, largest: float,
-                    step: float) -> float:
+
+        def stepped(
+            tracked: bool, sigma: float, value: float, target: float, largest: float, step: float
+        ) -> float:
             target = (target if sigma < _APPLIED_SIGMA else value) if tracked else 0.0
             return value + min(max(min(max(target, -largest), largest) - value, -step), step)
 
-        offset = stepped(sensor.track_time_offset, estimated.time_offset_sigma, self.time_offset,
-                         estimated.time_offset - sensor.time_offset, findings.LARGEST_OFFSET,
-                         _OFFSET_STEP)
-        readout = min(self.margin, stepped(   # at most the rows that the frames so far cover
-            sensor.track_readout_time, estimated.readout_time_sigma, self.readout_time,
-            max(estimated.readout_time, 0.0) - (sensor.readout_time or 0.0),
-            findings.LARGEST_READOUT, _READOUT_STEP))
+        offset = stepped(
+            sensor.track_time_offset,
+            estimated.time_offset_sigma,
+            self.time_offset,
+            estimated.time_offset - sensor.time_offset,
+            findings.LARGEST_OFFSET,
+            _OFFSET_STEP,
+        )
+        readout = min(
+            self.margin,
+            stepped(  # at most the rows that the frames so far cover
+                sensor.track_readout_time,
+                estimated.readout_time_sigma,
+                self.readout_time,
+                max(estimated.readout_time, 0.0) - (sensor.readout_time or 0.0),
+                findings.LARGEST_READOUT,
+                _READOUT_STEP,
+            ),
+        )
         ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
         return Applied(offset, readout, max(readout + ahead, 0.0))

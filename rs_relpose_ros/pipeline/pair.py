@@ -41,6 +41,7 @@ Frames = TypeVar('Frames')
 
 # -- Frames ------------------------------------------------------------------------------------
 
+
 @dataclass(slots=True, eq=False)
 class Frame(Generic[Result]):
     """A decoded image with its IMU data, and, once it has been processed, the result.
@@ -48,33 +49,35 @@ class Frame(Generic[Result]):
     Raises InputError if the image does not have the size of the intrinsics.
     """
 
-    stamp_ns: int   # of the header
-    image: NDArray[Any]   # (H, W) gray, as published: not rectified, not resized
+    stamp_ns: int  # of the header
+    image: NDArray[Any]  # (H, W) gray, as published: not rectified, not resized
     frame_id: str
     intrinsics: Intrinsics
     imu_data: FrameImu | None = None
     # For derotated images, whose `image` is (H, W) or (H, W, C) in its own encoding.
     encoding: str = 'mono8'
     encoded: EncodedImage | None = None
-    restart: bool = False   # time jumped since the frame before: tracks belong to another time
+    restart: bool = False  # time jumped since the frame before: tracks belong to another time
     # On the monotonic clock, 0 offline: arrival of the image or of the IMU sample behind its last
     # row, the later of the two; begin of the decoding.
     ready_ns: int = 0
     taken_ns: int = 0
-    seconds: float = 0.0   # wall time of the processing
+    seconds: float = 0.0  # wall time of the processing
     result: Result | None = None
 
     def __post_init__(self) -> None:
         if self.encoded is None and (self.image.dtype != np.uint8 or self.image.ndim != 2):
-            raise InputError('image must be (H, W) of uint8, '
-                             f'got {self.image.shape} of {self.image.dtype}')
+            raise InputError(
+                f'image must be (H, W) of uint8, got {self.image.shape} of {self.image.dtype}'
+            )
         height, width = self.image.shape[:2]
         expected = self.intrinsics.image_height, self.intrinsics.image_width
         if (height, width) != expected:
             raise InputError(
                 f'image is {width}x{height}, but its CameraInfo is for '
                 f'{expected[1]}x{expected[0]}: publish a CameraInfo of the same size (region of '
-                'interest and binning included)')
+                'interest and binning included)'
+            )
 
     @property
     def imu(self) -> FrameImu:
@@ -86,17 +89,26 @@ class Frame(Generic[Result]):
 
 # -- Pairs ---------------------------------------------------------------------------------
 
-def is_keyframe(config: KeyframeConfig, *, parallax: float, interval: float, frames: int,
-                tracked_fraction: float) -> bool:
+
+def is_keyframe(
+    config: KeyframeConfig,
+    *,
+    parallax: float,
+    interval: float,
+    frames: int,
+    tracked_fraction: float,
+) -> bool:
     """Whether the current frame creates a keyframe pair: enough parallax, or time is up.
 
     Since the reference keyframe: median parallax of the matches after derotation [px], interval
     [s], number of frames, and share of the keyframe's features that are still tracked.
     """
-    return (parallax >= config.min_keyframe_parallax
-            or tracked_fraction < config.min_tracked_fraction
-            or interval >= config.max_keyframe_interval
-            or frames >= config.max_keyframe_frames)
+    return (
+        parallax >= config.min_keyframe_parallax
+        or tracked_fraction < config.min_tracked_fraction
+        or interval >= config.max_keyframe_interval
+        or frames >= config.max_keyframe_frames
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,26 +119,26 @@ class PairResult:
     # header stamps, or those of their middle rows (`pose_row`).
     reference_stamp_ns: int
     stamp_ns: int
-    reference_ns1: int   # the same times on the IMU clock
+    reference_ns1: int  # the same times on the IMU clock
     reference_ns2: int
-    frame_id: str   # of the current image
-    interval: float   # [s] between the two reference times
-    pose: RelativePose   # its inliers are a mask over `matches`
-    matches: Matches   # pixels of the published images
-    row_times1: Array   # (N,) [s] from the stamped row
+    frame_id: str  # of the current image
+    interval: float  # [s] between the two reference times
+    pose: RelativePose  # its inliers are a mask over `matches`
+    matches: Matches  # pixels of the published images
+    row_times1: Array  # (N,) [s] from the stamped row
     row_times2: Array
-    rays1: Array   # (N, 3) unit, derotated by the gyro to the stamped row
+    rays1: Array  # (N, 3) unit, derotated by the gyro to the stamped row
     rays2: Array
-    parallax: float   # [px] median after derotation
-    landmarks_of: Callable[[], Landmarks] | None = None   # None without a pose
-    gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
+    parallax: float  # [px] median after derotation
+    landmarks_of: Callable[[], Landmarks] | None = None  # None without a pose
+    gyro_rotation: Array | None = None  # (3, 3) R_1^T R_2 integrated from the gyro
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
-    health: Assessment = NOT_EVALUATED   # by the pairs before: published before its assessment
-    tracked: Tracked | None = None   # this and applied: as after this pair
+    health: Assessment = NOT_EVALUATED  # by the pairs before: published before its assessment
+    tracked: Tracked | None = None  # this and applied: as after this pair
     applied: Applied = field(default_factory=Applied)
-    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed, IMU frame
-    image2: NDArray[np.uint8] | None = None   # only if the front end keeps images
+    gyro_bias: Array | None = None  # (3,) [rad/s] that was removed, IMU frame
+    image2: NDArray[np.uint8] | None = None  # only if the front end keeps images
 
     @property
     def landmarks(self) -> Landmarks | None:
@@ -144,9 +156,9 @@ class PairResult:
 class PairMetric(NamedTuple):
     """A published field of every pair; NaN is shown as an empty text."""
 
-    name: str   # with the unit; the key on /diagnostics and among the medians of summary.json
+    name: str  # with the unit; the key on /diagnostics and among the medians of summary.json
     of: Callable[[PairResult], float]
-    digits: int   # after the point, on /diagnostics
+    digits: int  # after the point, on /diagnostics
 
     def text(self, pair: PairResult | None) -> str:
         """As on /diagnostics."""
@@ -158,8 +170,11 @@ class PairMetric(NamedTuple):
 PAIR_METRICS = (
     PairMetric('matches', lambda pair: len(pair.matches), 0),
     PairMetric('inliers', lambda pair: int(np.count_nonzero(pair.pose.inliers)), 0),
-    PairMetric('inlier_ratio', lambda pair: np.count_nonzero(pair.pose.inliers)
-               / max(len(pair.matches), 1), 3),
+    PairMetric(
+        'inlier_ratio',
+        lambda pair: np.count_nonzero(pair.pose.inliers) / max(len(pair.matches), 1),
+        3,
+    ),
     PairMetric('parallax_px', lambda pair: pair.parallax, 1),
     PairMetric('residual_rms_px', lambda pair: pair.pose.residual_rms, 2),
     PairMetric('pixel_sigma_px', lambda pair: pair.pose.pixel_sigma, 3),
@@ -177,14 +192,15 @@ Ids = NDArray[np.uint32]
 class DerotatedRays:
     """Points of one image with their derotated rays."""
 
-    track_ids: Ids   # (N,)
-    points: Array   # (N, 2) pixels of the published image
-    rays: Array   # (N, 3) unit, in the camera frame of the stamped row
-    row_times: Array   # (N,) [s] from the stamped row
+    track_ids: Ids  # (N,)
+    points: Array  # (N, 2) pixels of the published image
+    rays: Array  # (N, 3) unit, in the camera frame of the stamped row
+    row_times: Array  # (N,) [s] from the stamped row
 
     @classmethod
-    def from_points(cls, track_ids: Ids, points: Array, sensor: Sensor,
-                    motion: FrameMotion) -> DerotatedRays:
+    def from_points(
+        cls, track_ids: Ids, points: Array, sensor: Sensor, motion: FrameMotion
+    ) -> DerotatedRays:
         """Rays of points (N, 2) of a published image."""
         return cls(track_ids, points, *sensor.derotated(points, motion))
 
@@ -195,8 +211,9 @@ class DerotatedRays:
             return None
         if len(rows) == len(self.track_ids):
             return self
-        return DerotatedRays(self.track_ids[rows], self.points[rows], self.rays[rows],
-                             self.row_times[rows])
+        return DerotatedRays(
+            self.track_ids[rows], self.points[rows], self.rays[rows], self.row_times[rows]
+        )
 
 
 @kernel
@@ -250,8 +267,12 @@ class GyroRotation:
         """Rotation since the frame before, if there was no gap."""
         segment = imu.since_previous
         assert segment is not None
-        return cls(*integration.integrate_rotation(
-            segment.stamps_ns, segment.angular_velocities, config, segment.bias_sigma), segment)
+        return cls(
+            *integration.integrate_rotation(
+                segment.stamps_ns, segment.angular_velocities, config, segment.bias_sigma
+            ),
+            segment,
+        )
 
 
 def interval_of(first: FrameImu, second: FrameImu) -> float:
@@ -265,14 +286,25 @@ def joined(before: FrameImu, imu: FrameImu) -> FrameImu:
         return replace(imu, since_previous=None)
     force = imu.force
     if not isinstance(force, str):
-        force = before.force if isinstance(before.force, str) else replace(
-            force, since_previous=before.force.since_previous.joined(force.since_previous))
-    return replace(imu, since_previous=before.since_previous.joined(imu.since_previous),
-                   force=force)
+        force = (
+            before.force
+            if isinstance(before.force, str)
+            else replace(
+                force, since_previous=before.force.since_previous.joined(force.since_previous)
+            )
+        )
+    return replace(
+        imu, since_previous=before.since_previous.joined(imu.since_previous), force=force
+    )
 
 
-def inertial_of(first: FrameImu, second: FrameImu, gyro: GyroRotation | None, since: FrameImu,
-                parameters: Parameters) -> InertialMotion | str:
+def inertial_of(
+    first: FrameImu,
+    second: FrameImu,
+    gyro: GyroRotation | None,
+    since: FrameImu,
+    parameters: Parameters,
+) -> InertialMotion | str:
     """Motion of a pair by the accelerometer, or the reason why it is not known.
 
     `gyro` and the force of `since` extend from frame to frame.
@@ -286,14 +318,25 @@ def inertial_of(first: FrameImu, second: FrameImu, gyro: GyroRotation | None, si
         return 'the gyro has a gap'
     if isinstance(since.force, str):
         return since.force
-    return integration.inertial_motion(gyro.segment, since.force.since_previous, first, second,
-                                       parameters.imu)
+    return integration.inertial_motion(
+        gyro.segment, since.force.since_previous, first, second, parameters.imu
+    )
 
 
-def estimate_pair(first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int], matches: Matches,
-                  sensor: Sensor, gyro: GyroRotation | None, inertial: InertialMotion | str,
-                  parameters: Parameters, *, interval: float | None, stamp_sigma: float = 0.0,
-                  between: Sequence[IntermediateFrame] = ()) -> RelativePose:
+def estimate_pair(
+    first: FrameImu,
+    second: FrameImu,
+    stamps_ns: tuple[int, int],
+    matches: Matches,
+    sensor: Sensor,
+    gyro: GyroRotation | None,
+    inertial: InertialMotion | str,
+    parameters: Parameters,
+    *,
+    interval: float | None,
+    stamp_sigma: float = 0.0,
+    between: Sequence[IntermediateFrame] = (),
+) -> RelativePose:
     """The relative pose of two frames from all that is known of them.
 
     `stamps_ns`: of both; they and the parameter `seed` are that of the samples.
@@ -304,47 +347,75 @@ def estimate_pair(first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int],
     configured = gyro if parameters.pair.use_gyro_rotation else None
     motion1, motion2, gravity_sigma = _with_gravity(first, second, parameters)
     pose = estimate_relative_pose(
-        sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
-        sensor.camera, motion1, motion2,
+        sensor.intrinsics.to_sensor(matches.points1),
+        sensor.intrinsics.to_sensor(matches.points2),
+        sensor.camera,
+        motion1,
+        motion2,
         relative_rotation=None if configured is None else configured.rotation,
         relative_rotation_covariance=None if configured is None else configured.covariance,
         interval=interval,
         config=validate.replaced(
-            parameters.estimator, gravity_sigma=gravity_sigma,
-            stamp_sigma=max(parameters.estimator.stamp_sigma, stamp_sigma)),
+            parameters.estimator,
+            gravity_sigma=gravity_sigma,
+            stamp_sigma=max(parameters.estimator.stamp_sigma, stamp_sigma),
+        ),
         quality=matches.quality,
         inertial=None if isinstance(inertial, str) else inertial,
         between=() if configured is None or interval is None else between,
-        rng=np.random.default_rng([parameters.pair.seed, *stamps_ns]))
+        rng=np.random.default_rng([parameters.pair.seed, *stamps_ns]),
+    )
     if isinstance(inertial, str):
         pose = pose.without_baseline(f'baseline not known: {inertial}')
     return pose
 
 
-def evidence_without(pose: RelativePose, first: FrameImu, second: FrameImu, sensor: Sensor,
-                     gyro: GyroRotation, inertial: InertialMotion,
-                     parameters: Parameters) -> velocity.InertialEvidence | None:
+def evidence_without(
+    pose: RelativePose,
+    first: FrameImu,
+    second: FrameImu,
+    sensor: Sensor,
+    gyro: GyroRotation,
+    inertial: InertialMotion,
+    parameters: Parameters,
+) -> velocity.InertialEvidence | None:
     """Consistency of the images with an acceleration that was not used; None if not known."""
     if pose.images is None:
         return None
     nothing, interval = np.empty((0, 2)), interval_of(first, second)
-    problem = build_problem(nothing, nothing, sensor.camera, first.motion, second.motion,
-                            gyro.rotation, gyro.covariance)
+    problem = build_problem(
+        nothing,
+        nothing,
+        sensor.camera,
+        first.motion,
+        second.motion,
+        gyro.rotation,
+        gyro.covariance,
+    )
     motion = parameters.estimator.motion
     expected, _ = velocity.expected_velocities(problem, motion, interval, inertial)
     return velocity.inertial_evidence(problem, pose.images, motion, interval, expected)
 
 
-def parallax_of(rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroRotation | None,
-                sensor: Sensor) -> float:
+def parallax_of(
+    rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroRotation | None, sensor: Sensor
+) -> float:
     """Median parallax [px] of matched rays after derotation."""
     rotation = aligning_rotation(rays1.rays.T @ rays2.rays) if gyro is None else gyro.rotation
     return sensor.camera.fx * median_parallax(rays1.rays, rays2.rays, rotation)
 
 
-def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: DerotatedRays,
-                rays2: DerotatedRays, pose: RelativePose, gyro: GyroRotation | None,
-                sensor: Sensor, parameters: Parameters) -> PairResult:
+def pair_result(
+    first: Frame[Any],
+    second: Frame[Any],
+    matches: Matches,
+    rays1: DerotatedRays,
+    rays2: DerotatedRays,
+    pose: RelativePose,
+    gyro: GyroRotation | None,
+    sensor: Sensor,
+    parameters: Parameters,
+) -> PairResult:
     """The pair with its pose and the values derived from it."""
     later_ns = to_nanoseconds(sensor.pose_row_delay)
     if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
@@ -352,31 +423,44 @@ def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: 
 
     @cache
     def points() -> Landmarks:
-        found = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
-                          sensor.camera)
-        to_image = sensor.intrinsics.to_image   # pixels of the published images
+        found = landmarks(
+            pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times, sensor.camera
+        )
+        to_image = sensor.intrinsics.to_image  # pixels of the published images
         return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
 
     return PairResult(
         reference_stamp_ns=first.stamp_ns + later_ns,
         stamp_ns=second.stamp_ns + later_ns,
-        reference_ns1=first.imu.reference_ns, reference_ns2=second.imu.reference_ns,
-        frame_id=second.frame_id, interval=interval_of(first.imu, second.imu), pose=pose,
-        matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
-        rays1=rays1.rays, rays2=rays2.rays, parallax=parallax_of(rays1, rays2, gyro, sensor),
+        reference_ns1=first.imu.reference_ns,
+        reference_ns2=second.imu.reference_ns,
+        frame_id=second.frame_id,
+        interval=interval_of(first.imu, second.imu),
+        pose=pose,
+        matches=matches,
+        row_times1=rays1.row_times,
+        row_times2=rays2.row_times,
+        rays1=rays1.rays,
+        rays2=rays2.rays,
+        parallax=parallax_of(rays1, rays2, gyro, sensor),
         landmarks_of=points if pose else None,
         gyro_rotation=None if gyro is None else gyro.rotation,
-        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias)
+        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias,
+    )
 
 
-def _with_gravity(imu1: FrameImu, imu2: FrameImu,
-                  parameters: Parameters) -> tuple[FrameMotion, FrameMotion, float]:
+def _with_gravity(
+    imu1: FrameImu, imu2: FrameImu, parameters: Parameters
+) -> tuple[FrameMotion, FrameMotion, float]:
     """Motions with gravity, both or none, and the sigma of gravity for the estimator."""
     sigma1, sigma2 = imu1.gravity_sigma, imu2.gravity_sigma
     configured = parameters.estimator.gravity_sigma
     if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
-        return (validate.replaced(imu1.motion, gravity=None),
-                validate.replaced(imu2.motion, gravity=None), configured)
+        return (
+            validate.replaced(imu1.motion, gravity=None),
+            validate.replaced(imu2.motion, gravity=None),
+            configured,
+        )
     # One sigma for both frames: that of the filter where it is larger than the parameter.
     return imu1.motion, imu2.motion, min(max(configured, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA)
 
@@ -401,8 +485,8 @@ class _TrackedFrame(NamedTuple):
     """A frame after the reference."""
 
     imu: FrameImu
-    gyro: GyroRotation   # since the reference
-    matches: Matches   # as tracked
+    gyro: GyroRotation  # since the reference
+    matches: Matches  # as tracked
 
 
 class TrackHistory:
@@ -416,8 +500,9 @@ class TrackHistory:
         """Add the current frame with its tracks."""
         self._frames.append(_TrackedFrame(imu, gyro, matches))
 
-    def between(self, matches: Matches, sensor: Sensor, since: FrameImu,
-                inertial: InertialMotion | str) -> list[IntermediateFrame]:
+    def between(
+        self, matches: Matches, sensor: Sensor, since: FrameImu, inertial: InertialMotion | str
+    ) -> list[IntermediateFrame]:
         """Frames between the reference and the last one, with the tracks of a pair's `matches`.
 
         `since`: IMU data of the last frame since the reference; `inertial`: motion of the pair.
@@ -426,18 +511,27 @@ class TrackHistory:
         chosen = used_frames(before)
         motions: list[InertialMotion | None] = [None] * len(chosen)
         if not isinstance(inertial, str):
-            motions = list(motions_on_the_way(inertial, self._reference, since,
-                                              [frame.imu for frame in chosen]))
+            motions = list(
+                motions_on_the_way(
+                    inertial, self._reference, since, [frame.imu for frame in chosen]
+                )
+            )
         drift = matches.points2 - _points(last.matches, matches)
         interval = self._interval(last.imu)
-        return [validate.unchecked(
-            IntermediateFrame,
-            points=sensor.intrinsics.to_sensor(_points(frame.matches, matches)
-                                               + self._interval(frame.imu) / interval * drift),
-            motion=frame.imu.motion, interval=self._interval(frame.imu),
-            relative_rotation=frame.gyro.rotation,
-            relative_rotation_covariance=frame.gyro.covariance, inertial=motion)
-            for frame, motion in zip(chosen, motions, strict=True)]
+        return [
+            validate.unchecked(
+                IntermediateFrame,
+                points=sensor.intrinsics.to_sensor(
+                    _points(frame.matches, matches) + self._interval(frame.imu) / interval * drift
+                ),
+                motion=frame.imu.motion,
+                interval=self._interval(frame.imu),
+                relative_rotation=frame.gyro.rotation,
+                relative_rotation_covariance=frame.gyro.covariance,
+                inertial=motion,
+            )
+            for frame, motion in zip(chosen, motions, strict=True)
+        ]
 
     def _interval(self, imu: FrameImu) -> float:
         """Seconds from the stamped row of the reference to that of a frame."""
@@ -447,10 +541,11 @@ class TrackHistory:
 def _points(tracked: Matches, wanted: Matches) -> Array:
     """Second points (N, 2) of the `wanted` tracks (N); NaN where one was not tracked."""
     rows = positions(tracked.track_ids, wanted.track_ids)
-    if len(rows) == len(wanted):   # no track was lost meanwhile, or changed its place
+    if len(rows) == len(wanted):  # no track was lost meanwhile, or changed its place
         return tracked.points2[rows]
     points = np.full((len(wanted), 2), np.nan)
-    _, here, there = np.intersect1d(wanted.track_ids, tracked.track_ids, assume_unique=True,
-                                    return_indices=True)
+    _, here, there = np.intersect1d(
+        wanted.track_ids, tracked.track_ids, assume_unique=True, return_indices=True
+    )
     points[here] = tracked.points2[there]
     return points

@@ -49,8 +49,8 @@ class _RotationStart:
     """An image that later ones are compared with, and the gyro's rotation since."""
 
     stamp_ns: int
-    ids: NDArray[np.uint32]   # (N,) of tracks
-    rays: Array   # (N, 3) as measured
+    ids: NDArray[np.uint32]  # (N,) of tracks
+    rays: Array  # (N, 3) as measured
     by_gyro: Array = field(default_factory=lambda: np.eye(3))
     frames: int = 0
 
@@ -58,7 +58,7 @@ class _RotationStart:
 class Processor(Generic[Result]):
     """Works on frames in the order of their stamps, in one thread."""
 
-    applied = Applied()   # tracked corrections for the next frame
+    applied = Applied()  # tracked corrections for the next frame
 
     def prepare(self) -> None:
         """Work ahead of the next frame; `process` does it if it has not been called."""
@@ -84,8 +84,9 @@ class Pipeline(Processor[PairResult]):
     instead of that of the parameters.
     """
 
-    def __init__(self, parameters: Parameters, keep_images: bool = False,
-                 tracker: Tracker | None = None) -> None:
+    def __init__(
+        self, parameters: Parameters, keep_images: bool = False, tracker: Tracker | None = None
+    ) -> None:
         missing = parameters.sensor.missing()
         if missing:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
@@ -93,24 +94,24 @@ class Pipeline(Processor[PairResult]):
         self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
         self._monitor = ConsistencyMonitor()
         self._sensor: Sensor | None = None
-        self._readout = 0.0   # [s] of its camera, beyond the parameter
+        self._readout = 0.0  # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
-        self._compare: Callable[[], None] | None = None   # after a pair
+        self._compare: Callable[[], None] | None = None  # after a pair
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference keyframe: tracking restarts with the next frame."""
-        self.prepare()   # live it is done by now
+        self.prepare()  # live it is done by now
         self._tracker.reset()
         self._stamps_ns.clear()
         self._reference: Frame[Any] | None = None
         self._previous: Frame[Any] | None = None
-        self._since: FrameImu | None = None   # of the last frame, since the reference
-        self._frames = 0   # since the reference
+        self._since: FrameImu | None = None  # of the last frame, since the reference
+        self._frames = 0  # since the reference
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
         self._rotation: _RotationStart | None = None
-        self._unmatched_ns: int | None = None   # of the last published pair with too few matches
+        self._unmatched_ns: int | None = None  # of the last published pair with too few matches
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> PairResult | None:
         """Track `frame`; the estimate of the keyframe pair that it creates, or None.
@@ -124,7 +125,7 @@ class Pipeline(Processor[PairResult]):
             self.reset()
             self._monitor = ConsistencyMonitor()
         if sensor != self._sensor:
-            self._current_rays = None   # their row times are those of the camera before
+            self._current_rays = None  # their row times are those of the camera before
         self._sensor, self._readout, imu = sensor, self.applied.readout_time, frame.imu
         self._stamps_ns.append(frame.stamp_ns)
         self._monitor.ahead.append(imu.ahead)
@@ -137,28 +138,35 @@ class Pipeline(Processor[PairResult]):
         self._frames += 1
         rotation = GyroRotation.of(imu, parameters.imu).rotation
         predicted = self._predicted(previous.imu.motion, imu.motion, rotation, sensor)
-        matches = self._tracker.track(frame.image, predicted, seconds_between(
-            previous.stamp_ns, frame.stamp_ns))
+        matches = self._tracker.track(
+            frame.image, predicted, seconds_between(previous.stamp_ns, frame.stamp_ns)
+        )
         self._previous = frame
         self._since = imu if self._since is None else pair.joined(self._since, imu)
         gyro = GyroRotation.of(self._since, parameters.imu)
         self._history.add(imu, gyro, matches)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, imu.motion, sensor)
         keyframe = pair.is_keyframe(
-            parameters.keyframes, parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
-            interval=pair.interval_of(reference.imu, imu), frames=self._frames,
-            tracked_fraction=self._tracker.tracked_fraction)
+            parameters.keyframes,
+            parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
+            interval=pair.interval_of(reference.imu, imu),
+            frames=self._frames,
+            tracked_fraction=self._tracker.tracked_fraction,
+        )
         if not keyframe:
             self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
             return None
-        self._compare = partial(self._compare_rotations, frame.stamp_ns, matches, rotation, sensor,
-                                keyframe)
+        self._compare = partial(
+            self._compare_rotations, frame.stamp_ns, matches, rotation, sensor, keyframe
+        )
         result = self._pair(reference, frame, gyro, sensor, parameters)
         self._restart_from(frame)
         if result.pose.status is Status.TOO_FEW_MATCHES:
             # Where nothing can be matched each frame creates a pair.
-            if self._unmatched_ns is not None and seconds_between(
-                    self._unmatched_ns, frame.stamp_ns) < _UNMATCHED_PERIOD:
+            if (
+                self._unmatched_ns is not None
+                and seconds_between(self._unmatched_ns, frame.stamp_ns) < _UNMATCHED_PERIOD
+            ):
                 return None
             self._unmatched_ns = frame.stamp_ns
         return result
@@ -185,8 +193,9 @@ class Pipeline(Processor[PairResult]):
 
     # -- rays and rotations --------------------------------------------------------------------
 
-    def _predicted(self, previous: FrameMotion, current: FrameMotion, rotation: Array,
-                   sensor: Sensor) -> Array | None:
+    def _predicted(
+        self, previous: FrameMotion, current: FrameMotion, rotation: Array, sensor: Sensor
+    ) -> Array | None:
         """Predicted pixels (N, 2) of the tracker's points in the current image, by the gyro.
 
         `rotation` (3, 3): ``R_1^T R_2`` since the previous image. None for a tracker without
@@ -203,8 +212,9 @@ class Pipeline(Processor[PairResult]):
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
         return sensor.project(rays @ rotation, row_times, current)
 
-    def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
-                  sensor: Sensor) -> tuple[DerotatedRays, DerotatedRays]:
+    def _derotate(
+        self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion, sensor: Sensor
+    ) -> tuple[DerotatedRays, DerotatedRays]:
         """Rays of matches in the reference and in the current image, which are kept."""
         # In the reference image points do not move: their rays are kept while they are tracked.
         known = self._reference_rays
@@ -215,8 +225,9 @@ class Pipeline(Processor[PairResult]):
         self._reference_rays, self._current_rays = first, second
         return first, second
 
-    def _compare_rotations(self, stamp_ns: int, matches: Matches, by_gyro: Array, sensor: Sensor,
-                           keyframe: bool) -> None:
+    def _compare_rotations(
+        self, stamp_ns: int, matches: Matches, by_gyro: Array, sensor: Sensor, keyframe: bool
+    ) -> None:
         """Compare the rotation of the images over some frames with that of the gyro.
 
         `by_gyro` (3, 3): since the previous image.
@@ -229,38 +240,75 @@ class Pipeline(Processor[PairResult]):
                 return
         ids = matches.track_ids[:_ROTATION_POINTS]
         rays = sensor.camera.unproject(
-            sensor.intrinsics.to_sensor(matches.points2[:_ROTATION_POINTS]))
+            sensor.intrinsics.to_sensor(matches.points2[:_ROTATION_POINTS])
+        )
         if before is not None:
             _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
             by_images = rotation_of_rays(before.rays[old], rays[new])
             if by_images is not None:
-                self._monitor.rotations.add(stamp_ns, seconds_between(before.stamp_ns, stamp_ns),
-                                            by_images, log_so3(before.by_gyro))
+                self._monitor.rotations.add(
+                    stamp_ns,
+                    seconds_between(before.stamp_ns, stamp_ns),
+                    by_images,
+                    log_so3(before.by_gyro),
+                )
         self._rotation = _RotationStart(stamp_ns, ids, rays)
 
     # -- one pair ----------------------------------------------------------------------------
 
-    def _pair(self, reference: Frame[Any], frame: Frame[Any], gyro: GyroRotation, sensor: Sensor,
-              parameters: Parameters) -> PairResult:
+    def _pair(
+        self,
+        reference: Frame[Any],
+        frame: Frame[Any],
+        gyro: GyroRotation,
+        sensor: Sensor,
+        parameters: Parameters,
+    ) -> PairResult:
         """The pair, suppressed by the state before it; updates the tracked corrections."""
         matches, monitor = self._tracker.refined_matches(), self._monitor
-        pose = self._estimated(reference.imu, frame.imu, (reference.stamp_ns, frame.stamp_ns),
-                               matches, gyro, sensor, parameters)
+        pose = self._estimated(
+            reference.imu,
+            frame.imu,
+            (reference.stamp_ns, frame.stamp_ns),
+            matches,
+            gyro,
+            sensor,
+            parameters,
+        )
         measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
-        fitted = pose.rejected or pose   # a contradiction shows what is wrong
+        fitted = pose.rejected or pose  # a contradiction shows what is wrong
         if np.isfinite(fitted.R).all():
             measurement = PairData(
-                to_sensor(matches.points1), to_sensor(matches.points2), sensor.camera,
-                reference.imu.motion, frame.imu.motion,
-                pair.interval_of(reference.imu, frame.imu), fitted.R, fitted.t, gyro.rotation,
-                gyro.covariance, rotation_sensitivity(
-                    segment.stamps_ns, segment.angular_velocities, parameters.imu),
-                segment, parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
+                to_sensor(matches.points1),
+                to_sensor(matches.points2),
+                sensor.camera,
+                reference.imu.motion,
+                frame.imu.motion,
+                pair.interval_of(reference.imu, frame.imu),
+                fitted.R,
+                fitted.t,
+                gyro.rotation,
+                gyro.covariance,
+                rotation_sensitivity(
+                    segment.stamps_ns, segment.angular_velocities, parameters.imu
+                ),
+                segment,
+                parameters.sensor.R_cam_imu,
+                parameters.estimator.gyro_sigma,
+            )
         bias, active = np.array(parameters.imu.gyro_bias), np.zeros(findings.DEVIATIONS)
-        configured = Configured(parameters.sensor, sensor.camera, bias, configured_sigmas(
-            parameters, seconds_between(*list(self._stamps_ns)[-2:])
-            - parameters.sensor.time_offset_reference_interval), active,
-            parameters.intrinsics.principal_point_sigma)
+        configured = Configured(
+            parameters.sensor,
+            sensor.camera,
+            bias,
+            configured_sigmas(
+                parameters,
+                seconds_between(*list(self._stamps_ns)[-2:])
+                - parameters.sensor.time_offset_reference_interval,
+            ),
+            active,
+            parameters.intrinsics.principal_point_sigma,
+        )
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
@@ -274,24 +322,44 @@ class Pipeline(Processor[PairResult]):
         rays1, rays2 = self._derotate(matches, reference.imu.motion, frame.imu.motion, sensor)
         latest = monitor.latest
         return replace(
-            pair.pair_result(reference, frame, matches, rays1, rays2, pose, gyro, sensor,
-                             parameters),
+            pair.pair_result(
+                reference, frame, matches, rays1, rays2, pose, gyro, sensor, parameters
+            ),
             images_against_gyro=None if latest is None else latest.images_against_gyro,
-            health=monitor.health, tracked=tracked, applied=self.applied,
-            image2=frame.image if self._keep_images else None)
+            health=monitor.health,
+            tracked=tracked,
+            applied=self.applied,
+            image2=frame.image if self._keep_images else None,
+        )
 
-    def _estimated(self, first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int],
-                   matches: Matches, gyro: GyroRotation, sensor: Sensor,
-                   parameters: Parameters) -> RelativePose:
+    def _estimated(
+        self,
+        first: FrameImu,
+        second: FrameImu,
+        stamps_ns: tuple[int, int],
+        matches: Matches,
+        gyro: GyroRotation,
+        sensor: Sensor,
+        parameters: Parameters,
+    ) -> RelativePose:
         """The pose, without the accelerometer if the images contradict it."""
         since, history, sigma = self._since, self._history, stamp_sigma(self._stamps_ns)
         assert since is not None
 
         def estimate(inertial: InertialMotion | str) -> RelativePose:
             return pair.estimate_pair(
-                first, second, stamps_ns, matches, sensor, gyro, inertial, parameters,
-                interval=pair.interval_of(first, second), stamp_sigma=sigma,
-                between=history.between(matches, sensor, since, inertial))
+                first,
+                second,
+                stamps_ns,
+                matches,
+                sensor,
+                gyro,
+                inertial,
+                parameters,
+                interval=pair.interval_of(first, second),
+                stamp_sigma=sigma,
+                between=history.between(matches, sensor, since, inertial),
+            )
 
         inertial = pair.inertial_of(first, second, gyro, since, parameters)
         acceleration = self._monitor.acceleration
@@ -300,8 +368,11 @@ class Pipeline(Processor[PairResult]):
             return estimate(inertial)
         used = acceleration.uses(None)
         pose = estimate(inertial if used else _CONTRADICTED)
-        evidence = pose.inertial_evidence if used else pair.evidence_without(
-            pose, first, second, sensor, gyro, inertial, parameters)
+        evidence = (
+            pose.inertial_evidence
+            if used
+            else pair.evidence_without(pose, first, second, sensor, gyro, inertial, parameters)
+        )
         if evidence is not None:
             self._monitor.add_acceleration(stamps_ns[1], evidence)
             if used and not acceleration.uses(evidence):
@@ -311,12 +382,13 @@ class Pipeline(Processor[PairResult]):
 
 # -- The loop over frames -------------------------------------------------------------------------
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFailed:
     """A frame with an error in its processing: the processor restarts with the next one."""
 
-    stamp_ns: int | None   # None if no frame had been taken yet
-    error: Exception   # of the package (`RsRelposeError`), or, live, a programming error
+    stamp_ns: int | None  # None if no frame had been taken yet
+    error: Exception  # of the package (`RsRelposeError`), or, live, a programming error
 
     @property
     def reason(self) -> str:
@@ -336,9 +408,15 @@ class FrameLoop(Generic[Result]):
     are those of `Sequencer`. Offline, programming errors leave `step`; live they are an outcome.
     """
 
-    def __init__(self, parameters: Parameters, processor: Processor[Result], *,
-                 offline: bool = False, colors: bool = False,
-                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        processor: Processor[Result],
+        *,
+        offline: bool = False,
+        colors: bool = False,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self.parameters = parameters
         self.sequencer = Sequencer(parameters, offline=offline, colors=colors, clock=clock)
         self._processor = processor
@@ -379,9 +457,15 @@ class FrameLoop(Generic[Result]):
 class FrontEnd(FrameLoop[PairResult]):
     """The loop that makes keyframe pairs; arguments as of `FrameLoop` and `Pipeline`."""
 
-    def __init__(self, parameters: Parameters, *, offline: bool = False,
-                 keep_images: bool = False, tracker: Tracker | None = None,
-                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        offline: bool = False,
+        keep_images: bool = False,
+        tracker: Tracker | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self._pipeline = Pipeline(parameters, keep_images, tracker)
         super().__init__(parameters, self._pipeline, offline=offline, clock=clock)
 

@@ -48,41 +48,41 @@ _LEAST_SPAN = 1e-4
 # Steps of a new fit of a pair.
 _NEW_STEPS = 3
 # Of a state: rotation and direction of translation.
-_POSE = np.r_[THETA:THETA + 3, TANGENT:TANGENT + 2]
+_POSE = np.r_[THETA : THETA + 3, TANGENT : TANGENT + 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairData:
     """Matches and motion of one pair, as configured, and the pose estimated from them."""
 
-    points1: Array   # (N, 2) pixels of the sensor
+    points1: Array  # (N, 2) pixels of the sensor
     points2: Array
     camera: RollingShutterCamera
-    motion1: FrameMotion   # about the stamped row
+    motion1: FrameMotion  # about the stamped row
     motion2: FrameMotion
-    interval: float   # [s]
-    R: Array   # (3, 3) as estimated, between the stamped rows
-    t: Array   # (3,) NaN where there is none
-    gyro_rotation: Array   # (3, 3) between the stamped rows
-    gyro_covariance: Array   # (3, 3) of that, as in the estimate
-    gyro_sensitivity: RotationSensitivity   # of that
-    segment: GyroSegment   # of that
+    interval: float  # [s]
+    R: Array  # (3, 3) as estimated, between the stamped rows
+    t: Array  # (3,) NaN where there is none
+    gyro_rotation: Array  # (3, 3) between the stamped rows
+    gyro_covariance: Array  # (3, 3) of that, as in the estimate
+    gyro_sensitivity: RotationSensitivity  # of that
+    segment: GyroSegment  # of that
     R_cam_imu: Array
-    gyro_sigma: float   # [rad/s] of the rate within a frame
+    gyro_sigma: float  # [rad/s] of the rate within a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairInformation:
     """Information of a pair on the calibration."""
 
-    S: Array   # (11, 11)
-    b: Array   # (11,)
-    if_distorted: float   # factor of both if the distortion is free: its residuals are no noise
-    pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
-    pose_by_center: Array   # (6, 2) the same by the principal point [px]
+    S: Array  # (11, 11)
+    b: Array  # (11,)
+    if_distorted: float  # factor of both if the distortion is free: its residuals are no noise
+    pose_by_deviation: Array  # (6, 11) of (dt, dtheta) in camera 1, first order
+    pose_by_center: Array  # (6, 2) the same by the principal point [px]
     # (5, 11) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
-    images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
+    images_against_gyro: Array  # (3,) [rad] Log of the rotation by images alone and R_gyro^T
 
 
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
@@ -92,11 +92,22 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     are too few matches, or if a fit far from the gyro's rotation diverges.
     """
     at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
-    pair = replace(pair, camera=_lens(pair.camera, *at[FOCAL:]),
-                   points1=pair.points1[::step], points2=pair.points2[::step])
+    pair = replace(
+        pair,
+        camera=_lens(pair.camera, *at[FOCAL:]),
+        points1=pair.points1[::step],
+        points2=pair.points2[::step],
+    )
     noise = pair.gyro_sensitivity.noise + _LEAST_ROTATION_SIGMA**2 * np.eye(3)
-    problem = build_problem(pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
-                            pair.gyro_rotation, noise)
+    problem = build_problem(
+        pair.points1,
+        pair.points2,
+        pair.camera,
+        pair.motion1,
+        pair.motion2,
+        pair.gyro_rotation,
+        noise,
+    )
     keep = problem.valid
     rotation, information = problem.rotation, problem.rotation_information
     if np.count_nonzero(keep) < PARAMETERS or rotation is None or information is None:
@@ -105,9 +116,16 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     moved = (turns @ at[:FOCAL])[None], (shares * at[READOUT])[None]
     rotation = so3.exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
     observations = _displaced(problem.observations[None, keep], *moved)[0]
-    prior = priors.Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
-                          np.ascontiguousarray(rotation), information,
-                          priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
+    prior = priors.Priors(
+        np.zeros(3),
+        np.zeros(3),
+        0.0,
+        0.0,
+        pair.gyro_sigma**-2,
+        np.ascontiguousarray(rotation),
+        information,
+        priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval),
+    )
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
     sigma = _noise(r)
@@ -115,8 +133,10 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     J_x = jacobian(observations, state)
     delays = np.zeros((FOCAL, *shares.shape))
     delays[READOUT] = _STEP * shares
-    stepped = (_displaced(observations[None], _STEP * np.moveaxis(turns, -1, 0), delays),
-               _displaced(_by_lens(pair, problem, keep), *moved))
+    stepped = (
+        _displaced(observations[None], _STEP * np.moveaxis(turns, -1, 0), delays),
+        _displaced(_by_lens(pair, problem, keep), *moved),
+    )
     J_c = (residuals(np.vstack(stepped).reshape(-1, 20), state).reshape(-1, len(r)) - r).T / _STEP
     # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro rotated by D c makes smaller.
     theta = so3.log_so3(np.ascontiguousarray(state.R @ rotation.T))
@@ -124,7 +144,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     priors.add_priors(state, prior, H, gradient)
     weighted = J_x.T * weights
     H, gradient, C = H + weighted @ J_x, gradient + weighted @ r, weighted @ J_c
-    C[THETA:THETA + 3] -= information @ D
+    C[THETA : THETA + 3] -= information @ D
     solved = inverse(H) @ np.column_stack([C, gradient])
     if not np.isfinite(solved).all():
         return None
@@ -133,21 +153,30 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     # The principal point is not estimated: axes of the IMU have nearly the same effect.
     S, b = 0.5 * (S + S.T)[:DEVIATIONS, :DEVIATIONS], b[:DEVIATIONS]
     ratio, if_distorted = _common_noise(
-        FitMatches(observations, weights, 1.0), (J_c - J_x @ solved[:, :-1])[:, :DEVIATIONS],
-        r - J_x @ solved[:, -1], S)
+        FitMatches(observations, weights, 1.0),
+        (J_c - J_x @ solved[:, :-1])[:, :DEVIATIONS],
+        r - J_x @ solved[:, -1],
+        S,
+    )
     S, b = S / ratio, b / ratio
     by_deviation, whitened = _shifts(pair, problem, state, H.copy(), C, D)
     # The rotation by the images: the step without the gyro's prior.
-    H[THETA:THETA + 3, THETA:THETA + 3] -= information
-    gradient[THETA:THETA + 3] -= information @ theta
+    H[THETA : THETA + 3, THETA : THETA + 3] -= information
+    gradient[THETA : THETA + 3] -= information @ theta
     return PairInformation(
-        S, b + S @ about, ratio / if_distorted, by_deviation[:, :DEVIATIONS],
-        by_deviation[:, DEVIATIONS:], whitened[:, :DEVIATIONS],
-        np.asarray(theta - (inverse(H) @ gradient)[THETA:THETA + 3]))
+        S,
+        b + S @ about,
+        ratio / if_distorted,
+        by_deviation[:, :DEVIATIONS],
+        by_deviation[:, DEVIATIONS:],
+        whitened[:, :DEVIATIONS],
+        np.asarray(theta - (inverse(H) @ gradient)[THETA : THETA + 3]),
+    )
 
 
-def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array,
-            D: Array) -> tuple[Array, Array]:
+def _shifts(
+    pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array, D: Array
+) -> tuple[Array, Array]:
     """Shift of the estimated pose by deviations and center, (6, 13), and whitened, (5, 13).
 
     With the prior of the estimate for the gyro's rotation; H and C are changed. The state is that
@@ -156,19 +185,23 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
     """
     assert problem.rotation_information is not None
     prior_information = np.linalg.inv(pair.gyro_covariance)
-    H[THETA:THETA + 3, THETA:THETA + 3] += prior_information - problem.rotation_information
-    C[THETA:THETA + 3] += (problem.rotation_information - prior_information) @ D
+    H[THETA : THETA + 3, THETA : THETA + 3] += prior_information - problem.rotation_information
+    C[THETA : THETA + 3] += (problem.rotation_information - prior_information) @ D
     covariance, tangent = inverse(H), so3.tangent_basis(state.t)
     moved = -covariance @ C
     to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
     share, rates = middle_share(pair.camera), pair.segment.angular_velocities
     rate1, rate2 = to_middle @ rates[0], to_middle @ (pair.gyro_rotation @ rates[-1])
-    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
-    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
+    moved[TANGENT : TANGENT + 2, READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
+    moved[THETA : THETA + 3, READOUT] += share * (rate1 - rate2)
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     # In the axes of the stamped row.
-    by_deviation = np.vstack([to_middle.T @ tangent @ moved[TANGENT:TANGENT + 2],
-                              to_middle.T @ moved[THETA:THETA + 3]])
+    by_deviation = np.vstack(
+        [
+            to_middle.T @ tangent @ moved[TANGENT : TANGENT + 2],
+            to_middle.T @ moved[THETA : THETA + 3],
+        ]
+    )
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
@@ -183,8 +216,11 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
     in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
     along = J[:, findings.DISTORTION]
     information = J.T * matches.weights @ J
-    without = r - along * ((along * matches.weights) @ r / (
-        np.diag(information)[findings.DISTORTION] + PRIOR_SIGMA[findings.DISTORTION]**-2.0))
+    without = r - along * (
+        (along * matches.weights)
+        @ r
+        / (np.diag(information)[findings.DISTORTION] + PRIOR_SIGMA[findings.DISTORTION] ** -2.0)
+    )
     independent = float((covariance * information).sum())
 
     def ratio(left: Array) -> float:
@@ -199,12 +235,14 @@ def _noise(r: Array) -> float:
     return max(1.4826 * so3.median(np.abs(r)), _LEAST_SIGMA)
 
 
-def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: priors.Priors,
-           fit: bool) -> TwoViewState:
+def _state(
+    pair: PairData, problem: TwoViewProblem, observations: Array, prior: priors.Priors, fit: bool
+) -> TwoViewState:
     """The estimate at the middle rows, at constant velocity; fitted again if there is no t."""
     delay = problem.reference_row_time
-    R = np.ascontiguousarray(problem.motion1.rotations([delay])[0] @ pair.R
-                             @ problem.motion2.rotations([delay])[0].T)
+    R = np.ascontiguousarray(
+        problem.motion1.rotations([delay])[0] @ pair.R @ problem.motion2.rotations([delay])[0].T
+    )
     t = pair.t
     if not np.isfinite(t).all():
         t, fit = translation_direction(observations, R), True
@@ -224,8 +262,12 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
         return camera
     coefficients = list(camera.distortion) or [0.0] * 4
     coefficients[0] += distortion
-    return replace(camera, fx=camera.fx / (1.0 + focal), fy=camera.fy / (1.0 + focal),
-                   distortion=tuple(coefficients) if any(coefficients) else camera.distortion)
+    return replace(
+        camera,
+        fx=camera.fx / (1.0 + focal),
+        fy=camera.fy / (1.0 + focal),
+        distortion=tuple(coefficients) if any(coefficients) else camera.distortion,
+    )
 
 
 def _gyro(pair: PairData) -> Array:
@@ -247,24 +289,39 @@ def _by_lens(pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -
     """
     camera, n = pair.camera, int(np.count_nonzero(keep))
     centre, out = np.array([camera.cx, camera.cy]), np.empty((4 * n, 20))
-    for k, (points, motion) in enumerate(((pair.points1[keep], problem.motion1),
-                                          (pair.points2[keep], problem.motion2))):
+    for k, (points, motion) in enumerate(
+        ((pair.points1[keep], problem.motion1), (pair.points2[keep], problem.motion2))
+    ):
         # With another focal length or centre, a pixel has the ray that another one has now.
-        rays, jacobian = camera.unproject_with_jacobian(np.concatenate([
-            centre + (1.0 + _STEP) * (points - centre), points,
-            points - (_STEP, 0.0), points - (0.0, _STEP)]))
+        rays, jacobian = camera.unproject_with_jacobian(
+            np.concatenate(
+                [
+                    centre + (1.0 + _STEP) * (points - centre),
+                    points,
+                    points - (_STEP, 0.0),
+                    points - (0.0, _STEP),
+                ]
+            )
+        )
         jacobian[:n] *= 1.0 + _STEP
-        rays[n:2 * n], jacobian[n:2 * n] = _lens(camera, 0.0, _STEP).unproject_with_jacobian(
-            points)
+        rays[n : 2 * n], jacobian[n : 2 * n] = _lens(camera, 0.0, _STEP).unproject_with_jacobian(
+            points
+        )
         tau = problem.observations[keep, 18 + k]
-        derotate(rays, jacobian, np.tile(motion.rotations(tau), (4, 1, 1)),
-                 camera.line_delay * motion.angular_velocity, out[:, 9 * k:9 * k + 9])
+        derotate(
+            rays,
+            jacobian,
+            np.tile(motion.rotations(tau), (4, 1, 1)),
+            camera.line_delay * motion.angular_velocity,
+            out[:, 9 * k : 9 * k + 9],
+        )
         out[:, 18 + k] = np.tile(tau, 4)
     return out.reshape(4, n, 20)
 
 
-def _by_rows(pair: PairData, problem: TwoViewProblem,
-             keep: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _by_rows(
+    pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Derivatives of rays (N, 2, 3, 9), rotated from their row to the middle one, on the left.
 
     By all deviations but those of the lens. Also the rows' signed shares (N, 2) of the readout
@@ -273,12 +330,13 @@ def _by_rows(pair: PairData, problem: TwoViewProblem,
     camera, n = pair.camera, np.count_nonzero(keep)
     half = 0.5 * (camera.row_time_span[1] - camera.row_time_span[0])
     turns, shares = np.empty((n, 2, 3, FOCAL)), np.empty((n, 2))
-    for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
-                                          (pair.points2, problem.motion2))):
+    for k, (points, motion) in enumerate(
+        ((pair.points1, problem.motion1), (pair.points2, problem.motion2))
+    ):
         shares[:, k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
         turn, tau = turns[:, k], problem.observations[keep, 18 + k]
         rate, along, acceleration = motion.angular_velocity, tau[:, None, None], np.zeros(3)
-        if half > 0.0 and motion.knot_times is not None:   # of the second half against the first
+        if half > 0.0 and motion.knot_times is not None:  # of the second half against the first
             first, last = map(so3.log_so3, motion.rotations([-half, half]))
             acceleration = (last + first) / half**2
         later = tau[:, None] * acceleration
@@ -304,12 +362,15 @@ def _displaced(observations: Array, turns: Array, delays: Array) -> Array:
             for column in range(18):
                 first, image, k = column - column % 3, column // 9, column % 3
                 p, q, turn = (k + 1) % 3, (k + 2) % 3, turns[deviation, i, image]
-                out[m, i, column] = (observations[given, i, column]
-                                     + turn[p] * observations[given, i, first + q]
-                                     - turn[q] * observations[given, i, first + p])
+                out[m, i, column] = (
+                    observations[given, i, column]
+                    + turn[p] * observations[given, i, first + q]
+                    - turn[q] * observations[given, i, first + p]
+                )
             for image in range(2):
-                out[m, i, 18 + image] = (observations[given, i, 18 + image]
-                                         + delays[deviation, i, image])
+                out[m, i, 18 + image] = (
+                    observations[given, i, 18 + image] + delays[deviation, i, image]
+                )
     return out
 
 
@@ -329,19 +390,23 @@ def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> Pai
     `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.
     """
     signed = pair.camera.line_delay * pair.camera.height + float(deviations[READOUT])
-    camera = replace(pair.camera, readout_time=abs(signed),
-                     readout_direction='down' if signed >= 0.0 else 'up')
+    camera = replace(
+        pair.camera, readout_time=abs(signed), readout_direction='down' if signed >= 0.0 else 'up'
+    )
     known, (begin, end) = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9, camera.row_time_span
     begin, end = begin - _LEAST_SPAN, end + _LEAST_SPAN
-    first, second = (seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k])
-                     + float(deviations[OFFSET]) for k in (0, -1))
+    first, second = (
+        seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k]) + float(deviations[OFFSET])
+        for k in (0, -1)
+    )
     if first + begin < 0.0 or second + end > known[-1]:
         return None
 
     def between(start: float, stop: float) -> tuple[Array, Array]:
         times = np.concatenate([[start], known[(known > start) & (known < stop)], [stop]])
         return times, np.column_stack(
-            [np.interp(times, known, axis) for axis in gyro.angular_velocities.T])
+            [np.interp(times, known, axis) for axis in gyro.angular_velocities.T]
+        )
 
     times, rates = between(first, second)
     rotation = so3.integrated_rotations(times, rates)[-1]
@@ -350,10 +415,19 @@ def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> Pai
         rows, row_rates = between(stamped + begin, stamped + end)
         motions.append(FrameMotion.from_gyro(rows - stamped, row_rates))
     return replace(
-        pair, camera=camera, motion1=motions[0], motion2=motions[1], R=rotation,
-        t=np.full(3, np.nan), gyro_rotation=rotation, segment=replace(
-            pair.segment, angular_velocities=rates,
-            stamps_ns=gyro.stamps_ns[0] + np.round(times * 1e9).astype(np.int64)))
+        pair,
+        camera=camera,
+        motion1=motions[0],
+        motion2=motions[1],
+        R=rotation,
+        t=np.full(3, np.nan),
+        gyro_rotation=rotation,
+        segment=replace(
+            pair.segment,
+            angular_velocities=rates,
+            stamps_ns=gyro.stamps_ns[0] + np.round(times * 1e9).astype(np.int64),
+        ),
+    )
 
 
 def _far_in_time(deviations: Array) -> bool:
@@ -380,15 +454,15 @@ PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
 class Calibration:
     """Estimated deviations from the configuration."""
 
-    c: Array   # (11,)
-    covariance: Array   # (11, 11)
-    S: Array   # (N, 11, 11) and (N, 11): of the pairs, without a prior
+    c: Array  # (11,)
+    covariance: Array  # (11, 11)
+    S: Array  # (N, 11, 11) and (N, 11): of the pairs, without a prior
     b: Array
-    if_distorted: Array   # (N,) factors of these
-    about: Array   # (11,) about which they are linearised, in the mean by their information
-    scatter: float   # variance of the scores over that by S: 1 where residuals are independent
-    shared: float   # factor of the variances by errors that are common to all pairs
-    widened: float   # and by the number of pairs
+    if_distorted: Array  # (N,) factors of these
+    about: Array  # (11,) about which they are linearised, in the mean by their information
+    scatter: float  # variance of the scores over that by S: 1 where residuals are independent
+    shared: float  # factor of the variances by errors that are common to all pairs
+    widened: float  # and by the number of pairs
 
     @property
     def sigma(self) -> Array:
@@ -397,8 +471,16 @@ class Calibration:
 
 
 NOTHING_ESTIMATED = Calibration(
-    np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.zeros((0, DEVIATIONS, DEVIATIONS)),
-    np.zeros((0, DEVIATIONS)), np.zeros(0), np.zeros(DEVIATIONS), 1.0, 1.0, 1.0)
+    np.zeros(DEVIATIONS),
+    np.diag(PRIOR_SIGMA**2),
+    np.zeros((0, DEVIATIONS, DEVIATIONS)),
+    np.zeros((0, DEVIATIONS)),
+    np.zeros(0),
+    np.zeros(DEVIATIONS),
+    1.0,
+    1.0,
+    1.0,
+)
 
 
 class LastSeconds(deque[Any]):
@@ -422,8 +504,8 @@ class _Entry(NamedTuple):
 
     stamp_ns: int
     data: PairData
-    active: Array   # (11,)
-    about: Array   # (11,)
+    active: Array  # (11,)
+    about: Array  # (11,)
     information: PairInformation
 
 
@@ -433,8 +515,9 @@ class Recursion:
     def __init__(self) -> None:
         self._pairs = LastSeconds(MOST_PAIRS, WINDOW_NS)
 
-    def add(self, stamp_ns: int, data: PairData, active: Array,
-            about: Array) -> PairInformation | None:
+    def add(
+        self, stamp_ns: int, data: PairData, active: Array, about: Array
+    ) -> PairInformation | None:
         """Add a pair, in the order of time; its information by `pair_information`."""
         information = pair_information(data, active, about)
         if information is not None:
@@ -445,14 +528,15 @@ class Recursion:
         """Linearise the furthest pairs about the last one's deviations; whether there are any."""
         last = self._pairs[-1]
         apart = np.linalg.norm(
-            (np.array([pair.about for pair in self._pairs]) - last.about) / PRIOR_SIGMA, axis=1)
+            (np.array([pair.about for pair in self._pairs]) - last.about) / PRIOR_SIGMA, axis=1
+        )
         if len(apart) > 1 and _far_in_time(last.about - last.active):
-            apart[-2] = math.inf   # now the gyro after it is known
+            apart[-2] = math.inf  # now the gyro after it is known
         chosen = [k for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN] if apart[k] >= _NEAR]
         for k in chosen:
             data, active = self._pairs[k].data, self._pairs[k].active
             gyro, later = data.segment, last.about - active
-            if _far_in_time(later):   # by the gyro there
+            if _far_in_time(later):  # by the gyro there
                 for n in (k - 1, k + 1):
                     other = self._pairs[n].data.segment if 0 <= n < len(self._pairs) else gyro
                     first, second = (other, gyro) if n < k else (gyro, other)
@@ -470,8 +554,10 @@ class Recursion:
         n = len(self._pairs)
         if not n:
             return NOTHING_ESTIMATED
-        S, b, if_distorted = (np.array([getattr(pair.information, name) for pair in self._pairs])
-                              for name in ('S', 'b', 'if_distorted'))
+        S, b, if_distorted = (
+            np.array([getattr(pair.information, name) for pair in self._pairs])
+            for name in ('S', 'b', 'if_distorted')
+        )
         # Scaled by the prior: the deviations have different units.
         scale = PRIOR_SIGMA
         hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
@@ -480,10 +566,20 @@ class Recursion:
         # Sandwich (White, Econometrica 1982), about the solution: scores about zero contain it.
         scores = b - S @ c
         sandwich = covariance @ (scores.T @ scores) @ covariance
-        widened, shared = ((n + _FEW_PAIRS) / n)**2, 1.0 + _SHARED**2 * n
+        widened, shared = ((n + _FEW_PAIRS) / n) ** 2, 1.0 + _SHARED**2 * n
         ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * widened
         weights = np.einsum('pii->pi', S)
         about = (weights * [pair.about for pair in self._pairs]).sum(axis=0) / np.maximum(
-            weights.sum(axis=0), np.finfo(float).tiny)
-        return Calibration(c, shared * covariance * np.sqrt(np.outer(ratios, ratios)), S, b,
-                           if_distorted, about, float(np.median(ratios)), shared, widened)
+            weights.sum(axis=0), np.finfo(float).tiny
+        )
+        return Calibration(
+            c,
+            shared * covariance * np.sqrt(np.outer(ratios, ratios)),
+            S,
+            b,
+            if_distorted,
+            about,
+            float(np.median(ratios)),
+            shared,
+            widened,
+        )

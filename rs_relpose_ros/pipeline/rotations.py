@@ -43,7 +43,7 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
         return None
     first, second = rays1[finite], rays2[finite]
     rotation = aligning_rotation(first.T @ second)
-    squares = ((first - second @ rotation.T)**2).sum(axis=1)
+    squares = ((first - second @ rotation.T) ** 2).sum(axis=1)
     weights = 1.0 / (1.0 + squares / max(float(np.median(squares)), 1e-12))
     return log_so3(aligning_rotation((first.T * weights) @ second))
 
@@ -56,21 +56,22 @@ class RotationComparison:
     gyro's is rotated and scaled: 0 if nothing remains, 1 or more if both are independent.
     """
 
-    left_as_configured: float   # no rotation
-    left_of_all: float   # no rotation, and no constant rate removed
-    left_at_best: float   # `rotation`
-    left_mirrored: float   # the best reflection: a gyro with left-handed axes
-    rotation: Array   # (3, 3) Q: the true gyro is Q times the configured one
-    reflection: Array   # (3, 3) the best one
-    scale: float   # images over gyro, after `rotation`
-    by_gyro: float   # [rad] sum of the angles
+    left_as_configured: float  # no rotation
+    left_of_all: float  # no rotation, and no constant rate removed
+    left_at_best: float  # `rotation`
+    left_mirrored: float  # the best reflection: a gyro with left-handed axes
+    rotation: Array  # (3, 3) Q: the true gyro is Q times the configured one
+    reflection: Array  # (3, 3) the best one
+    scale: float  # images over gyro, after `rotation`
+    by_gyro: float  # [rad] sum of the angles
     count: int
 
     @property
     def is_turned(self) -> bool:
         """Whether axes are interchanged: `rotation` is large, and better for certain."""
         return self.angle > _LARGE_ANGLE and self._certain(
-            self.left_as_configured, self.left_at_best)
+            self.left_as_configured, self.left_at_best
+        )
 
     @property
     def is_left_handed(self) -> bool:
@@ -107,19 +108,31 @@ class RotationSums(LastSeconds):
         if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:
             return None
         left_of_all = _left(float((theta * phi).sum()), theta, phi)
-        theta, phi = (   # without the constant rate that fits best
+        theta, phi = (  # without the constant rate that fits best
             one - np.outer(intervals, intervals @ one / (intervals @ intervals))
-            for one in (theta, phi))
+            for one in (theta, phi)
+        )
         M = theta.T @ phi
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
         (rotation, trace), (reflection, mirrored) = (
-            (np.ascontiguousarray((U * (1.0, 1.0, sign)) @ Vt),
-             float(singular[0] + singular[1] + sign * singular[2])) for sign in (handed, -handed))
+            (
+                np.ascontiguousarray((U * (1.0, 1.0, sign)) @ Vt),
+                float(singular[0] + singular[1] + sign * singular[2]),
+            )
+            for sign in (handed, -handed)
+        )
         return RotationComparison(
-            _left(float(np.trace(M)), theta, phi), left_of_all, _left(trace, theta, phi),
-            _left(mirrored, theta, phi), rotation, reflection,
-            trace / max(float((phi**2).sum()), _NO_ROTATION), by_gyro, len(self))
+            _left(float(np.trace(M)), theta, phi),
+            left_of_all,
+            _left(trace, theta, phi),
+            _left(mirrored, theta, phi),
+            rotation,
+            reflection,
+            trace / max(float((phi**2).sum()), _NO_ROTATION),
+            by_gyro,
+            len(self),
+        )
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:
@@ -146,7 +159,7 @@ class AccelerationSums(LastSeconds):
 
     def __init__(self) -> None:
         super().__init__(MOST_PAIRS, WINDOW_NS)
-        self._fault, self._fault_ns, self._faulty = '', 0, False   # of the samples
+        self._fault, self._fault_ns, self._faulty = '', 0, False  # of the samples
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
         """Note the acceleration of a pair, or the reason why it has none."""
@@ -178,13 +191,25 @@ class AccelerationSums(LastSeconds):
         likelihood = f'with the images (log-likelihood {configured:+.0f})'
         if self.contradicts:
             return Finding(
-                'accel_axes', FindingState.SUSPECT, f'accelerometer inconsistent {likelihood}, '
-                'not used until both agree',
+                'accel_axes',
+                FindingState.SUSPECT,
+                f'accelerometer inconsistent {likelihood}, not used until both agree',
                 'reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
-                if opposite > _CERTAIN else 'correct the driver: the axes differ from those of '
-                'the gyro, or the data are of another IMU', observable=True)
-        return Finding('accel_axes', FindingState.OK, f'accelerometer consistent {likelihood}',
-                       observable=True) if configured > _CERTAIN else None
+                if opposite > _CERTAIN
+                else 'correct the driver: the axes differ from those of '
+                'the gyro, or the data are of another IMU',
+                observable=True,
+            )
+        return (
+            Finding(
+                'accel_axes',
+                FindingState.OK,
+                f'accelerometer consistent {likelihood}',
+                observable=True,
+            )
+            if configured > _CERTAIN
+            else None
+        )
 
     def _sums(self) -> tuple[float, float]:
         return sum(configured for _, configured, _ in self), sum(one for _, _, one in self)

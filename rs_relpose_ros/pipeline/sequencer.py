@@ -77,9 +77,9 @@ class SequencerCounts:
     imu_samples: int = 0
     imu_gaps: int = 0
     clock_jumps: int = 0
-    imu_repeated: int = 0   # samples with the stamp of an earlier one, dropped
-    imu_late: int = 0   # samples that came after a younger one, sorted in
-    imu_wild: int = 0   # samples with a stamp far from those before and after, dropped
+    imu_repeated: int = 0  # samples with the stamp of an earlier one, dropped
+    imu_late: int = 0  # samples that came after a younger one, sorted in
+    imu_wild: int = 0  # samples with a stamp far from those before and after, dropped
 
 
 @dataclass(slots=True, eq=False)
@@ -88,13 +88,13 @@ class QueuedFrame:
 
     image: EncodedImage
     intrinsics: Intrinsics
-    span_ns: tuple[int, int]   # of the exposure on the IMU clock, without a tracked offset
-    reference_ns: int   # of the stamped row
-    exposure: float   # of a row [s]
-    received_ns: int   # on the monotonic clock
+    span_ns: tuple[int, int]  # of the exposure on the IMU clock, without a tracked offset
+    reference_ns: int  # of the stamped row
+    exposure: float  # of a row [s]
+    received_ns: int  # on the monotonic clock
     generation: int
-    ahead: float   # [s] newest stamp of the gyro as it came, less `reference_ns`
-    ready_ns: int | None = None   # None until the IMU covers its last row
+    ahead: float  # [s] newest stamp of the gyro as it came, less `reference_ns`
+    ready_ns: int | None = None  # None until the IMU covers its last row
 
 
 class _StampOrder:
@@ -103,7 +103,7 @@ class _StampOrder:
     def __init__(self, patience: float) -> None:
         self._patience = patience
         self._back_ns, self._count = 0, 0
-        self._wild_ns: int | None = None   # the last one, unless the clock jumped to it
+        self._wild_ns: int | None = None  # the last one, unless the clock jumped to it
 
     def is_wild(self, stamp_ns: int, last_ns: int | None) -> bool:
         """Whether a stamp is far from the last one (zero), and no other came before it there."""
@@ -132,12 +132,18 @@ class Sequencer:
     `colors` images are decoded in their own encoding. `clock`: monotonic [ns]; set by tests.
     """
 
-    def __init__(self, parameters: Parameters, *, offline: bool = False, colors: bool = False,
-                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        offline: bool = False,
+        colors: bool = False,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self._parameters, self._offline = parameters, offline
         self._R_cam_imu = parameters.sensor.R_cam_imu
         self._colors, self._levels = colors, GrayLevels()
-        self.gyro_only = False   # whether frames are without gravity and specific force
+        self.gyro_only = False  # whether frames are without gravity and specific force
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
         self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
         # Longest interval of frames that the gyro is integrated over: half of the history is left
@@ -153,7 +159,7 @@ class Sequencer:
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
         self._last_stamp_ns: int | None = None
         self._intervals = timing.FrameIntervals()
-        self._previous_ns: int | None = None   # reference time of the frame taken before
+        self._previous_ns: int | None = None  # reference time of the frame taken before
         # Tracked corrections.
         self._offset_ns = self._margin_ns = 0
         # Number of jumps in time: when frames came, and as they are taken.
@@ -174,8 +180,10 @@ class Sequencer:
                 return
             newest_ns, set_back = buffer.newest_ns, order.is_set_back(stamp_ns, last_ns)
             if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
-                self._restart(Refusal.CLOCK_JUMP, 'IMU stamps jumped back by '
-                              f'{seconds_between(stamp_ns, newest_ns):.3f} s')
+                self._restart(
+                    Refusal.CLOCK_JUMP,
+                    f'IMU stamps jumped back by {seconds_between(stamp_ns, newest_ns):.3f} s',
+                )
                 buffer.clear()
                 last_ns = None
             added = buffer.add(sample)
@@ -201,15 +209,27 @@ class Sequencer:
             interval_ns = self._intervals.add(stamp_ns)
             # A quarter: of stamps that jitter.
             if interval_ns and clock.exposure_time * NANOSECONDS > 1.25 * interval_ns:
-                self._refuse(stamp_ns, Refusal.BAD_IMAGE, 'exposure_time is longer than the '
-                             f'interval between frames, {interval_ns / NANOSECONDS:.4f} s')
+                self._refuse(
+                    stamp_ns,
+                    Refusal.BAD_IMAGE,
+                    'exposure_time is longer than the '
+                    f'interval between frames, {interval_ns / NANOSECONDS:.4f} s',
+                )
                 return
             reference_ns = clock.reference_ns(stamp_ns, interval_ns)
             newest_ns = self._buffer.gyro.newest_ns
-            self._queue.append(QueuedFrame(
-                image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns), reference_ns,
-                clock.exposure(interval_ns), received_ns=self._now(), generation=self._generation,
-                ahead=0.0 if newest_ns is None else seconds_between(reference_ns, newest_ns)))
+            self._queue.append(
+                QueuedFrame(
+                    image,
+                    intrinsics,
+                    clock.exposed_span_ns(stamp_ns, interval_ns),
+                    reference_ns,
+                    clock.exposure(interval_ns),
+                    received_ns=self._now(),
+                    generation=self._generation,
+                    ahead=0.0 if newest_ns is None else seconds_between(reference_ns, newest_ns),
+                )
+            )
             self._update_queue()
 
     def pass_over(self, stamp_ns: int) -> None:
@@ -267,12 +287,21 @@ class Sequencer:
             return head
         image, taken_ns = head.image, self._now()
         try:
-            values, encoding = image.pixels(self._levels) if self._colors else (
-                image.decoded(self._levels), 'mono8')
+            values, encoding = (
+                image.pixels(self._levels)
+                if self._colors
+                else (image.decoded(self._levels), 'mono8')
+            )
             frame: Frame[Any] = Frame(
-                image.stamp_ns, values, image.frame_id, head.intrinsics, encoding=encoding,
-                encoded=image if self._colors else None, ready_ns=head.ready_ns or 0,
-                taken_ns=taken_ns)
+                image.stamp_ns,
+                values,
+                image.frame_id,
+                head.intrinsics,
+                encoding=encoding,
+                encoded=image if self._colors else None,
+                ready_ns=head.ready_ns or 0,
+                taken_ns=taken_ns,
+            )
         except InputError as error:
             with self._changed:
                 self._refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
@@ -280,18 +309,32 @@ class Sequencer:
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
-            if (head.generation != self._generation
-                    or self._buffer.gyro.coverage(*span_ns) is not Coverage.AVAILABLE):
-                self._refuse(frame.stamp_ns, Refusal.CLOCK_JUMP, 'stamps jumped while the frame '
-                             'was decoded: its gyro samples are lost')
+            if (
+                head.generation != self._generation
+                or self._buffer.gyro.coverage(*span_ns) is not Coverage.AVAILABLE
+            ):
+                self._refuse(
+                    frame.stamp_ns,
+                    Refusal.CLOCK_JUMP,
+                    'stamps jumped while the frame was decoded: its gyro samples are lost',
+                )
                 return self._refusals.popleft()
             reference_ns, previous_ns = head.reference_ns + self._offset_ns, self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
             frame.imu_data = replace(
-                frame_imu(self._buffer, span_ns, reference_ns, self._R_cam_imu, previous_ns,
-                          head.exposure, gyro_only=self.gyro_only),
-                applied_offset_ns=self._offset_ns, ahead=head.ahead)
+                frame_imu(
+                    self._buffer,
+                    span_ns,
+                    reference_ns,
+                    self._R_cam_imu,
+                    previous_ns,
+                    head.exposure,
+                    gyro_only=self.gyro_only,
+                ),
+                applied_offset_ns=self._offset_ns,
+                ahead=head.ahead,
+            )
             frame.restart = self._taken_generation != self._generation
             self._previous_ns, self._taken_generation = reference_ns, self._generation
             self._counts.frames_taken += 1
@@ -310,9 +353,11 @@ class Sequencer:
             head = self._queue[0]
             start_ns, end_ns = self._corrected(head.span_ns)
             # A tracked offset may have moved a frame that was ready.
-            coverage = (self._buffer.gyro.coverage(start_ns, end_ns)
-                        if head.ready_ns is not None and self._imu_reaches(end_ns)
-                        else Coverage.NOT_YET)
+            coverage = (
+                self._buffer.gyro.coverage(start_ns, end_ns)
+                if head.ready_ns is not None and self._imu_reaches(end_ns)
+                else Coverage.NOT_YET
+            )
             if coverage is Coverage.AVAILABLE:
                 return self._queue.popleft()
             if coverage is Coverage.NEVER:
@@ -320,8 +365,12 @@ class Sequencer:
             elif self._closed:
                 self._drop(head, Refusal.NO_IMU, 'the gyro ends before the last row of the frame')
             elif not self._offline and self._now() >= head.received_ns + MAX_IMU_WAIT_NS:
-                self._drop(head, Refusal.NO_IMU, 'no gyro sample that covers the last row of the '
-                           f'frame came within {MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+                self._drop(
+                    head,
+                    Refusal.NO_IMU,
+                    'no gyro sample that covers the last row of the '
+                    f'frame came within {MAX_IMU_WAIT_NS / NANOSECONDS:g} s',
+                )
         return self._refusals.popleft() if self._refusals else None
 
     def _update_queue(self) -> None:
@@ -339,18 +388,24 @@ class Sequencer:
             ready += 1
         if not self._offline:
             for _ in range(ready - MAILBOX_FRAMES):
-                self._drop(self._queue[0], Refusal.OVERLOAD,
-                           'the worker was too slow, newer frames wait')
+                self._drop(
+                    self._queue[0], Refusal.OVERLOAD, 'the worker was too slow, newer frames wait'
+                )
             while len(self._queue) > WAITING_FRAMES:
-                self._drop(self._queue[0], Refusal.NO_IMU,
-                           f'{WAITING_FRAMES} newer frames wait for the gyro')
+                self._drop(
+                    self._queue[0],
+                    Refusal.NO_IMU,
+                    f'{WAITING_FRAMES} newer frames wait for the gyro',
+                )
         if ready:
             self._changed.notify()
 
     def _corrected(self, span_ns: tuple[int, int]) -> tuple[int, int]:
         """Times of a frame's first and last row, with the corrections tracked by now."""
-        return (span_ns[0] + self._offset_ns - self._margin_ns,
-                span_ns[1] + self._offset_ns + self._margin_ns)
+        return (
+            span_ns[0] + self._offset_ns - self._margin_ns,
+            span_ns[1] + self._offset_ns + self._margin_ns,
+        )
 
     def _imu_reaches(self, end_ns: int) -> bool:
         """Whether gyro and accelerometer, which may have a topic each, have come to a time."""
@@ -358,8 +413,9 @@ class Sequencer:
         if gyro_ns is None or gyro_ns < end_ns:
             return False
         # Gravity must not depend on which of two topics came first.
-        return (force_ns is None or force_ns >= end_ns
-                or gyro_ns - force_ns > _ACCELEROMETER_STALE_NS)
+        return (
+            force_ns is None or force_ns >= end_ns or gyro_ns - force_ns > _ACCELEROMETER_STALE_NS
+        )
 
     # -- refusals and jumps of a clock -------------------------------------------------------
 
@@ -367,9 +423,13 @@ class Sequencer:
         """Whether a frame of this stamp is added; else it is refused. Time may restart with it."""
         last_ns = self._last_stamp_ns
         if last_ns is not None and self._frame_order.is_wild(stamp_ns, last_ns):
-            self._refuse(stamp_ns, Refusal.OUT_OF_ORDER, 'the stamp of the frame is '
-                         f'{seconds_between(last_ns, stamp_ns):.0f} s from the one before, and '
-                         'no other is near it')
+            self._refuse(
+                stamp_ns,
+                Refusal.OUT_OF_ORDER,
+                'the stamp of the frame is '
+                f'{seconds_between(last_ns, stamp_ns):.0f} s from the one before, and '
+                'no other is near it',
+            )
             return False
         set_back = self._frame_order.is_set_back(stamp_ns, last_ns)
         if last_ns is None or stamp_ns > last_ns:
@@ -379,8 +439,11 @@ class Sequencer:
             return False
         back = seconds_between(stamp_ns, last_ns)
         if not set_back and last_ns - stamp_ns <= CLOCK_JUMP_NS:
-            self._refuse(stamp_ns, Refusal.OUT_OF_ORDER,
-                         f'the frame is {back:.3f} s older than the one before')
+            self._refuse(
+                stamp_ns,
+                Refusal.OUT_OF_ORDER,
+                f'the frame is {back:.3f} s older than the one before',
+            )
             return False
         self._restart(Refusal.CLOCK_JUMP, f'image stamps jumped back by {back:.3f} s')
         # The IMU may have jumped already, and then has the samples of this frame. After a small

@@ -44,20 +44,42 @@ from rs_relpose_ros.tracking.images import RawImage
 _WIDTH, _HEIGHT = 320, 240
 _PR_SET_PDEATHSIG = 1
 # With distortion, so that its kernels are compiled, too.
-_INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
-                         image_width=_WIDTH, image_height=_HEIGHT,
-                         distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
+_INTRINSICS = Intrinsics(
+    width=_WIDTH,
+    height=_HEIGHT,
+    fx=250.0,
+    fy=250.0,
+    cx=159.5,
+    cy=119.5,
+    image_width=_WIDTH,
+    image_height=_HEIGHT,
+    distortion_model='plumb_bob',
+    distortion=(-0.02, 0.01, 0.0, 0.0),
+)
 # What would keep made-up frames from being processed is replaced by these.
-MADE_UP_SENSOR = {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0],
-                  'time_offset': 0.0, 'stamp_exposure': 'middle'}
-_ROTATION = np.eye(3), 1e-4 * np.eye(3)   # by the gyro, with its covariance
+MADE_UP_SENSOR = {
+    'readout_time': 0.02,
+    'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0],
+    'time_offset': 0.0,
+    'stamp_exposure': 'middle',
+}
+_ROTATION = np.eye(3), 1e-4 * np.eye(3)  # by the gyro, with its covariance
 
 
 def warm_up(config: EstimatorConfig | None = None) -> None:
     """Compile (or load from the cache) every kernel of an estimate with `config`."""
     points1, points2, camera, motion = _sideways()
-    estimate_relative_pose(points1, points2, camera, motion, motion, *_ROTATION, 0.2,
-                           config=config, between=[_halfway()])
+    estimate_relative_pose(
+        points1,
+        points2,
+        camera,
+        motion,
+        motion,
+        *_ROTATION,
+        0.2,
+        config=config,
+        between=[_halfway()],
+    )
 
 
 def warm_up_pipeline(parameters: Parameters) -> None:
@@ -65,9 +87,10 @@ def warm_up_pipeline(parameters: Parameters) -> None:
 
     Detector, solver and filters are those of `parameters`.
     """
-    parameters = parameters.updated({**MADE_UP_SENSOR, 'feature_rows': [0.0, 0.0],
-                                     'max_keyframe_frames': 1})
-    warm_up(parameters.estimator)   # with a frame between
+    parameters = parameters.updated(
+        {**MADE_UP_SENSOR, 'feature_rows': [0.0, 0.0], 'max_keyframe_frames': 1}
+    )
+    warm_up(parameters.estimator)  # with a frame between
     for with_force in (True, False):
         for frame in made_up_frames(FrontEnd(parameters, offline=True), with_force):
             if frame.result is not None and frame.result.landmarks_of is not None:
@@ -90,8 +113,12 @@ def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator
 def _images() -> Iterator[NDArray[np.uint8]]:
     """A far wall behind a near one, from a camera that moves and then stops."""
     noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
-    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255,
-                               cv2.NORM_MINMAX) for layer in noise)
+    far, near = (
+        cv2.normalize(
+            cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255, cv2.NORM_MINMAX
+        )
+        for layer in noise
+    )
     for shift in (0, 4, 8, 8):
         image = np.roll(far, -shift, axis=1)
         image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
@@ -106,15 +133,22 @@ def _halfway() -> IntermediateFrame:
 def _estimation() -> Estimation:
     points1, points2, camera, motion = _sideways()
     problem = build_problem(points1, points2, camera, motion, motion, *_ROTATION)
-    return Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
-                      np.zeros(1, dtype=np.uint64), None)
+    return Estimation(
+        problem,
+        MODES['auto'],
+        EstimatorConfig(),
+        np.arange(len(points1)),
+        np.zeros(1, dtype=np.uint64),
+        None,
+    )
 
 
 def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     """Matches of a camera that moves to its right, for the warm-up."""
     rng = np.random.default_rng(0)
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                                  readout_time=0.03)
+    camera = RollingShutterCamera(
+        width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5, readout_time=0.03
+    )
     motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
     world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
     return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
@@ -122,20 +156,33 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
 
 def fill_cache() -> None:
     """Compile the kernels of the default parameters, on two cores, one process each."""
-    gc.set_threshold(100_000)   # syntax trees do not become garbage: a tenth faster
+    gc.set_threshold(100_000)  # syntax trees do not become garbage: a tenth faster
     other_half = multiprocessing.get_context('fork').Process(
-        target=_fill_half, args=(os.getpid(),))
+        target=_fill_half, args=(os.getpid(),)
+    )
     other_half.start()
     for solver in MODES[EstimatorConfig().solver].solvers:
         assert solver.address
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
     points1, points2, camera, motion = _sideways()
-    pose = RelativePose(status=Status.OK, inliers=np.ones(len(points1), dtype=bool),
-                        R=np.eye(3), t=np.eye(3)[0], residual_rms=1.0)
-    frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION, None),
-                           [_halfway()], camera, EstimatorConfig())
-    _estimation().sample()   # with what the other process has compiled by then
+    pose = RelativePose(
+        status=Status.OK,
+        inliers=np.ones(len(points1), dtype=bool),
+        R=np.eye(3),
+        t=np.eye(3)[0],
+        residual_rms=1.0,
+    )
+    frames_between.refined(
+        pose,
+        points1,
+        motion,
+        (points2, motion, 0.2, *_ROTATION, None),
+        [_halfway()],
+        camera,
+        EstimatorConfig(),
+    )
+    _estimation().sample()  # with what the other process has compiled by then
     other_half.join()
     warm_up_pipeline(Parameters())
     _mark().touch()
@@ -150,14 +197,16 @@ def _fill_half(parent: int) -> None:
 def _end_with(parent: int) -> None:
     """Let the kernel of Linux end this process with its parent, or with the thread of it."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:   # it has ended already
+    if os.getppid() != parent:  # it has ended already
         signal.raise_signal(signal.SIGKILL)
 
 
 def _mark() -> Path:
     """File of a filled cache: by sources, version and machine."""
-    return Path(exp_so3.stats.cache_path,
-                f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}')
+    return Path(
+        exp_so3.stats.cache_path,
+        f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}',
+    )
 
 
 def cache_is_filled() -> bool:
@@ -168,8 +217,10 @@ def cache_is_filled() -> bool:
 def fill_cache_if_empty() -> None:
     """Compile in processes of their own: their memory, some 700 MB, is freed."""
     if not cache_is_filled():
-        subprocess.run([sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up',
-                        str(os.getpid())], check=False)
+        subprocess.run(
+            [sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up', str(os.getpid())],
+            check=False,
+        )
 
 
 def release_compiler() -> None:
@@ -177,7 +228,7 @@ def release_compiler() -> None:
     advise = ctypes.CDLL(None).madvise
     for line in Path('/proc/self/maps').read_text().splitlines():
         addresses, access, *_, path = line.split(maxsplit=5)
-        if access == 'r-xp' and 'llvmlite' in path:   # unchanged pages of the file
+        if access == 'r-xp' and 'llvmlite' in path:  # unchanged pages of the file
             start, end = (int(address, 16) for address in addresses.split('-'))
             advise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), mmap.MADV_DONTNEED)
 

@@ -71,7 +71,7 @@ def normalise(v: Array) -> None:
     for k in range(len(v)):
         largest = max(largest, abs(v[k]))
     for k in range(len(v)):
-        v[k] /= largest   # first, so that squares neither overflow nor vanish
+        v[k] /= largest  # first, so that squares neither overflow nor vanish
         total += v[k] * v[k]
     total = math.sqrt(total)
     for k in range(len(v)):
@@ -190,7 +190,7 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
             derivatives[m, k] = derivatives[m + 1, k + 1] * ((k + 1) / (n - m))
     for m in range(1, n + 1):
         # Row m is monotonic between the roots of the previous one.
-        q, cuts, count = derivatives[m, :m + 1], roots[:count].copy(), 0
+        q, cuts, count = derivatives[m, : m + 1], roots[:count].copy(), 0
         left, at_left = -1.0, value(q, -1.0)
         for k in range(len(cuts) + 1):
             right = cuts[k] if k < len(cuts) else 1.0
@@ -207,7 +207,7 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
                 # An extremum c, if no root follows, which may nearly touch zero: near it,
                 # p(x) = p(c) + p''(c) (x - c)^2 / 2, row n - 2 being p'' / 2.
                 following = value(q, cuts[k + 1] if k + 1 < len(cuts) else 1.0)
-                h2 = at_right / value(derivatives[n - 2, :n - 1], right)
+                h2 = at_right / value(derivatives[n - 2, : n - 1], right)
                 limit = 0.5 * PAIR_TOLERANCE * (1.0 / zoom + zoom * right * right)
                 if (following > 0.0) == (at_right > 0.0) and 0.0 <= h2 < limit * limit:
                     roots[count], half_gaps[count] = right, math.sqrt(h2)
@@ -222,6 +222,7 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
 # samples around angle 0, so that zeros which cluster there within about `zoom`, where D is smaller
 # by orders of magnitude than on the rest of the circle, are resolved.
 
+
 def half_angle_nodes(degree: int) -> Array:
     """Cosine and sine (2n + 1, 2) of the half angles of the samples of D."""
     half = np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
@@ -232,7 +233,7 @@ def half_angle_matrix(degree: int) -> Array:
     """Matrix (2n + 1, 2n + 1) from samples to ascending coefficients in x, at zoom 1."""
     c, s = half_angle_nodes(degree).T[:, :, None]
     power = np.arange(2 * degree + 1)
-    return np.linalg.inv(c**(2 * degree - power) * s**power)
+    return np.linalg.inv(c ** (2 * degree - power) * s**power)
 
 
 @kernel

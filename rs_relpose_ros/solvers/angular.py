@@ -18,16 +18,37 @@ from rs_relpose_ros.solvers.common import Knowledge, Sample, Solutions
 MAX_5PT = 10
 
 # Monomials, the cubic ones in Nister's order: the first ten are eliminated.
-_CUBIC = ['xxx', 'yyy', 'xxy', 'xyy', 'xxz', 'xx1', 'yyz', 'yy1', 'xyz', 'xy1',
-          'xzz', 'xz1', 'x11', 'yzz', 'yz1', 'y11', 'zzz', 'zz1', 'z11', '111']
+_CUBIC = [
+    'xxx',
+    'yyy',
+    'xxy',
+    'xyy',
+    'xxz',
+    'xx1',
+    'yyz',
+    'yy1',
+    'xyz',
+    'xy1',
+    'xzz',
+    'xz1',
+    'x11',
+    'yzz',
+    'yz1',
+    'y11',
+    'zzz',
+    'zz1',
+    'z11',
+    '111',
+]
 _QUADRATIC = ['xx', 'xy', 'xz', 'x1', 'yy', 'yz', 'y1', 'zz', 'z1', '11']
 _ORDER = 'xyz1'
 
 
 def _product_table(left: list[str], products: list[str]) -> NDArray[np.int64]:
     """Index in `products` of each monomial of `left` times each of x, y, z, 1."""
-    return np.array([[products.index(''.join(sorted(m + v, key=_ORDER.index))) for v in _ORDER]
-                     for m in left])
+    return np.array(
+        [[products.index(''.join(sorted(m + v, key=_ORDER.index))) for v in _ORDER] for m in left]
+    )
 
 
 _TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
@@ -243,10 +264,12 @@ def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
     count = 0
     for k in range(found):
         R = out.R[count]
-        if _essential_matrix(B, math.tan(0.5 * angles[k]), basis, E) \
-                and _decompose(E, sample, R, x) \
-                and common.polish(sample, factors, axes, R, x[:3], 6) \
-                and not common.is_known(R, out.R[:count]) \
-                and common.write_solution(sample, factors, R, x[:3], out.x[count]):
+        if (
+            _essential_matrix(B, math.tan(0.5 * angles[k]), basis, E)
+            and _decompose(E, sample, R, x)
+            and common.polish(sample, factors, axes, R, x[:3], 6)
+            and not common.is_known(R, out.R[:count])
+            and common.write_solution(sample, factors, R, x[:3], out.x[count])
+        ):
             count += 1
     return count

@@ -26,26 +26,74 @@ LINEAR = Model('linear', derotated=False, velocities=True)
 ANGULAR = Model('angular', derotated=True, velocities=False)
 GLOBAL = Model('global', derotated=False, velocities=False)
 
-SOLVERS = {solver.name: solver for solver in (
-    Solver('uniform_9pt', 9, UNIFORM, uniform.solve_with_gravity, uniform.MAX_9PT,
-           'Uniform 9-point algorithm: gravity and angular velocity known.', needs_gravity=True),
-    Solver('uniform_11pt', 11, UNIFORM, uniform.solve_uniform_11pt, uniform.MAX_11PT,
-           'Uniform 11-point algorithm: angular velocity known.', starts_from_rotation=True),
-    Solver('linear_9pt', 9, LINEAR, uniform.solve_with_gravity, uniform.MAX_9PT,
-           'Linear 9-point algorithm: gravity known, no angular velocity.', needs_gravity=True),
-    Solver('angular_5pt', 5, ANGULAR, angular.solve_5pt, angular.MAX_5PT,
-           'Angular 5-point algorithm: angular velocity known, no linear velocity.'),
-    Solver('angular_3pt', 3, ANGULAR, uniform.solve_with_gravity, uniform.MAX_3PT,
-           'Angular 3-point algorithm: gravity and angular velocity known, no linear velocity.',
-           needs_gravity=True),
-    Solver('global_5pt', 5, GLOBAL, angular.solve_5pt, angular.MAX_5PT,
-           "Global-shutter 5-point algorithm, the paper's baseline."),
-)}
+SOLVERS = {
+    solver.name: solver
+    for solver in (
+        Solver(
+            'uniform_9pt',
+            9,
+            UNIFORM,
+            uniform.solve_with_gravity,
+            uniform.MAX_9PT,
+            'Uniform 9-point algorithm: gravity and angular velocity known.',
+            needs_gravity=True,
+        ),
+        Solver(
+            'uniform_11pt',
+            11,
+            UNIFORM,
+            uniform.solve_uniform_11pt,
+            uniform.MAX_11PT,
+            'Uniform 11-point algorithm: angular velocity known.',
+            starts_from_rotation=True,
+        ),
+        Solver(
+            'linear_9pt',
+            9,
+            LINEAR,
+            uniform.solve_with_gravity,
+            uniform.MAX_9PT,
+            'Linear 9-point algorithm: gravity known, no angular velocity.',
+            needs_gravity=True,
+        ),
+        Solver(
+            'angular_5pt',
+            5,
+            ANGULAR,
+            angular.solve_5pt,
+            angular.MAX_5PT,
+            'Angular 5-point algorithm: angular velocity known, no linear velocity.',
+        ),
+        Solver(
+            'angular_3pt',
+            3,
+            ANGULAR,
+            uniform.solve_with_gravity,
+            uniform.MAX_3PT,
+            'Angular 3-point algorithm: gravity and angular velocity known, no linear velocity.',
+            needs_gravity=True,
+        ),
+        Solver(
+            'global_5pt',
+            5,
+            GLOBAL,
+            angular.solve_5pt,
+            angular.MAX_5PT,
+            "Global-shutter 5-point algorithm, the paper's baseline.",
+        ),
+    )
+}
 
 # No solver of the public table: it does not estimate the rotation.
-GYRO_2PT = Solver('gyro_2pt', 2, ANGULAR, common.solve_gyro_2pt, 1,
-                  'Gyro 2-point algorithm: rotation known, no linear velocity.',
-                  needs_rotation=True)
+GYRO_2PT = Solver(
+    'gyro_2pt',
+    2,
+    ANGULAR,
+    common.solve_gyro_2pt,
+    1,
+    'Gyro 2-point algorithm: rotation known, no linear velocity.',
+    needs_rotation=True,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,42 +152,58 @@ def as_function(row: Solver) -> Callable[..., list[MinimalSolution]]:
     """The solver of a row as a pure function."""
     n = row.sample_size
 
-    def solve(rays1: ArrayLike, rays2: ArrayLike, tau1: ArrayLike, tau2: ArrayLike, *,
-              gravity1: ArrayLike | None = None, gravity2: ArrayLike | None = None,
-              start_rotations: ArrayLike | None = None) -> list[MinimalSolution]:
-        sample = Sample(validate.unit_vectors('rays1', rays1, (n, 3)),
-                        validate.unit_vectors('rays2', rays2, (n, 3)),
-                        validate.array('tau1', tau1, (n,)), validate.array('tau2', tau2, (n,)))
+    def solve(
+        rays1: ArrayLike,
+        rays2: ArrayLike,
+        tau1: ArrayLike,
+        tau2: ArrayLike,
+        *,
+        gravity1: ArrayLike | None = None,
+        gravity2: ArrayLike | None = None,
+        start_rotations: ArrayLike | None = None,
+    ) -> list[MinimalSolution]:
+        sample = Sample(
+            validate.unit_vectors('rays1', rays1, (n, 3)),
+            validate.unit_vectors('rays2', rays2, (n, 3)),
+            validate.array('tau1', tau1, (n,)),
+            validate.array('tau2', tau2, (n,)),
+        )
         known = common.no_knowledge()
         if row.needs_gravity:
-            known = known._replace(align1=_alignment('gravity1', gravity1),
-                                   align2=_alignment('gravity2', gravity2))
+            known = known._replace(
+                align1=_alignment('gravity1', gravity1), align2=_alignment('gravity2', gravity2)
+            )
         if not row.starts_from_rotation:
             return list(_solutions(row, sample, known))
         found: list[MinimalSolution] = []
         for start in validate.rotations('start_rotations', start_rotations, ('K', 3, 3)):
             # |R - R'| = 2 sqrt(2) |sin(angle / 2)|: two starts of one solution agree to 1e-7 rad.
-            found.extend(s for s in _solutions(
-                row, sample, known._replace(rotation=start, predicted=True))
-                if all(np.linalg.norm(s.R - other.R) > np.sqrt(2.0) * 1e-7 for other in found))
+            found.extend(
+                s
+                for s in _solutions(row, sample, known._replace(rotation=start, predicted=True))
+                if all(np.linalg.norm(s.R - other.R) > np.sqrt(2.0) * 1e-7 for other in found)
+            )
         return found
 
     solve.__name__ = solve.__qualname__ = row.name
     rays = 'derotated by the gyro' if row.model.derotated else 'as measured'
     solve.__doc__ = f'{row.summary}\n\n    {str(row.solve.__doc__).rstrip()}' + _ARGUMENTS.format(
-        n=n, rays=rays)
+        n=n, rays=rays
+    )
     return solve
 
 
 def _alignment(name: str, gravity: ArrayLike | None) -> Array:
     if gravity is None:
-        raise InputError(f'{name} must be given to this solver: the direction of free fall (3,) '
-                         'in the camera frame')
+        raise InputError(
+            f'{name} must be given to this solver: the direction of free fall (3,) '
+            'in the camera frame'
+        )
     return common.gravity_alignment(validate.unit_vectors(name, gravity, (3,)))
 
 
 def _solutions(row: Solver, sample: Sample, known: Knowledge) -> Iterator[MinimalSolution]:
     out = common.empty_solutions(row.most_solutions)
     for k in range(common.run_solver(row.address, sample, known, out)):
-        t, d1, d2 = out.x[k].reshape(3, 3)   # without velocities zero
+        t, d1, d2 = out.x[k].reshape(3, 3)  # without velocities zero
         yield MinimalSolution(out.R[k], t, d1, out.R[k].T @ d2)

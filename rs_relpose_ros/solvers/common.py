@@ -31,18 +31,18 @@ from rs_relpose_ros.solvers.algebra import cholesky, lu_factor, lu_solve, newton
 class Sample(NamedTuple):
     """A minimal sample of n matches."""
 
-    f1: Array   # (n, 3) unit rays in their camera's frame, derotated by the gyro if the model is
-    f2: Array   # likewise
-    tau1: Array   # (n,) row times [s] relative to the reference row
-    tau2: Array   # likewise
+    f1: Array  # (n, 3) unit rays in their camera's frame, derotated by the gyro if the model is
+    f2: Array  # likewise
+    tau1: Array  # (n,) row times [s] relative to the reference row
+    tau2: Array  # likewise
 
 
 class Knowledge(NamedTuple):
     """Known quantities besides the matches; `Solver` has the ones that a solver uses."""
 
-    align1: Array   # (3, 3) rotation of the camera's gravity onto +z (`gravity_alignment`)
-    align2: Array   # likewise
-    rotation: Array   # (3, 3) a predicted R, if `predicted`
+    align1: Array  # (3, 3) rotation of the camera's gravity onto +z (`gravity_alignment`)
+    align2: Array  # likewise
+    rotation: Array  # (3, 3) a predicted R, if `predicted`
     predicted: bool
 
 
@@ -76,15 +76,15 @@ class Solver:
     """A row of the table of solvers."""
 
     name: str
-    sample_size: int   # matches of a minimal sample
+    sample_size: int  # matches of a minimal sample
     model: Model
     # Kernel that writes all solutions, the sign of t by the majority of the points; their number.
     solve: Callable[[Sample, Knowledge, Solutions], int]
     most_solutions: int
-    summary: str   # first line of its documentation; the rest is that of `solve`
-    needs_gravity: bool = False   # both alignments of `Knowledge`
-    needs_rotation: bool = False   # the predicted rotation of `Knowledge`
-    starts_from_rotation: bool = False   # iterative, with `Knowledge.rotation` as first guess
+    summary: str  # first line of its documentation; the rest is that of `solve`
+    needs_gravity: bool = False  # both alignments of `Knowledge`
+    needs_rotation: bool = False  # the predicted rotation of `Knowledge`
+    starts_from_rotation: bool = False  # iterative, with `Knowledge.rotation` as first guess
 
     @property
     def address(self) -> int:
@@ -93,8 +93,11 @@ class Solver:
 
 
 _INTERFACE = KernelInterface(
-    numba.int64, Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))), no_knowledge(),
-    empty_solutions(1))
+    numba.int64,
+    Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))),
+    no_knowledge(),
+    empty_solutions(1),
+)
 # In compiled code: solve_at(address, sample, known, out).
 solve_at: Callable[[int, Sample, Knowledge, Solutions], int] = _INTERFACE.call
 
@@ -117,8 +120,11 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
     for k in range(sample.f1.shape[0]):
         f1, h = sample.f1[k], rotated(R, sample.f2[k])
         tau1, tau2 = sample.tau1[k], sample.tau2[k]
-        b = (x[0] + (tau2 * x[6] - tau1 * x[3]), x[1] + (tau2 * x[7] - tau1 * x[4]),
-             x[2] + (tau2 * x[8] - tau1 * x[5]))
+        b = (
+            x[0] + (tau2 * x[6] - tau1 * x[3]),
+            x[1] + (tau2 * x[7] - tau1 * x[4]),
+            x[2] + (tau2 * x[8] - tau1 * x[5]),
+        )
         along1, along2, cosine = dot(f1, b), dot(h, b), dot(f1, h)
         # Both depths times sin^2 of the angle between the rays.
         depth1 = along1 - cosine * along2
@@ -137,6 +143,7 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
 #
 # has one unknown angle psi. The paper has ``R = R(phi_2, theta_2)^T R(psi) R(phi_1, theta_1)``
 # (section 'Gravity and Angular Velocity Measurements'), for the inverse R and a vertical along y.
+
 
 @kernel
 def gravity_alignment(gravity: Array) -> Array:
@@ -201,15 +208,16 @@ def yaw_cluster(sample: Sample, known: Knowledge) -> tuple[float, float]:
 # rotation: determinants differ by a constant factor, solutions by a linear map
 # (`write_solution`).
 
+
 class RowTimeFactors(NamedTuple):
     """Row times of a sample, scaled."""
 
-    p: Array   # (n,)
-    q: Array   # (n,)
-    m: float   # mean row time [s]
-    s_p: float   # [s]
-    s_q: float   # [s]
-    observable: bool   # False for equal row times: velocities are then not observable
+    p: Array  # (n,)
+    q: Array  # (n,)
+    m: float  # mean row time [s]
+    s_p: float  # [s]
+    s_q: float  # [s]
+    observable: bool  # False for equal row times: velocities are then not observable
 
 
 @kernel
@@ -240,6 +248,7 @@ def row_time_factors(sample: Sample) -> RowTimeFactors:
 # All solvers end with Newton's method on ``A(R) y = 0``, which removes the rounding of polynomials
 # and eliminations: y is t, or (y_1, y_2, y_3), of length 1.
 
+
 @kernel
 def write_rows(sample: Sample, factors: RowTimeFactors, R: Array, A: Array, first: int) -> None:
     """Write A(R), rows n or ``[n, p n, q n]``, into the columns of `A` from `first` on."""
@@ -269,8 +278,15 @@ def write_nearest_vector(sample: Sample, factors: RowTimeFactors, R: Array, y: A
 
 
 @inlined_kernel
-def linearise(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array,
-              system: Array, right: Array) -> tuple[float, float]:
+def linearise(
+    sample: Sample,
+    factors: RowTimeFactors,
+    axes: Array,
+    R: Array,
+    y: Array,
+    system: Array,
+    right: Array,
+) -> tuple[float, float]:
     """Write the n + 1 equations of a Newton step (`polish`); ``|A(R) y|^2`` and ``|A(R)|^2``."""
     n, k, m = sample.f1.shape[0], axes.shape[0], y.shape[0]
     write_rows(sample, factors, R, system, k)
@@ -280,8 +296,11 @@ def linearise(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y:
         b = (y[0], y[1], y[2])
         if m > 3:
             p, q = factors.p[i], factors.q[i]
-            b = (b[0] + p * y[3] + q * y[6], b[1] + p * y[4] + q * y[7],
-                 b[2] + p * y[5] + q * y[8])
+            b = (
+                b[0] + p * y[3] + q * y[6],
+                b[1] + p * y[4] + q * y[7],
+                b[2] + p * y[5] + q * y[8],
+            )
         by_theta = cross(rotated(R, sample.f2[i]), cross(b, sample.f1[i]))
         for j in range(k):
             system[i, j] = dot(axes[j], by_theta)
@@ -297,8 +316,9 @@ def linearise(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y:
 
 
 @kernel
-def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array,
-           steps: int) -> bool:
+def polish(
+    sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array, steps: int
+) -> bool:
     """Newton's method from `R` (3, 3) and `y` (m,), in place; whether it has converged.
 
     R moves about the `axes` (k, 3), n equations having n + 1 = m + k unknowns with ``|y| = 1``. A
@@ -314,7 +334,7 @@ def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Ar
             error = squares
             copy_matrix(R_new, R)
             copy_vector(y_new, y)
-            if error < 1e-30 * size2:   # rounding
+            if error < 1e-30 * size2:  # rounding
                 return True
             lu_factor(system, pivots)
             lu_solve(system, pivots, right)
@@ -357,7 +377,7 @@ def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, 
     With the sign that has more points in front of both cameras.
     """
     for i in range(3):
-        difference = 0.0   # d_2 - d_1
+        difference = 0.0  # d_2 - d_1
         if len(y) > 3:
             difference, x[6 + i] = y[3 + i] / factors.s_p, y[6 + i] / factors.s_q
             x[3 + i] = x[6 + i] - difference
@@ -370,7 +390,7 @@ def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, 
     front, behind = cheirality_votes(sample, R, x)
     if behind > front:
         for i in range(9):
-            x[i] = 0.0 - x[i]   # not -x: a velocity of zero stays +0
+            x[i] = 0.0 - x[i]  # not -x: a velocity of zero stays +0
     return True
 
 

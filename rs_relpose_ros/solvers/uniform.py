@@ -49,7 +49,7 @@ def solve_with_gravity(sample: Sample, known: Knowledge, out: Solutions) -> int:
         samples[k] = algebra.lu_factor(A, pivots) * weight**degree
     angles, half_gaps = np.empty(2 * degree), np.empty(2 * degree)
     found = algebra.angles_of_zeros(matrix @ samples, zoom, angles, half_gaps)
-    y, axes = np.empty(n), known.align1[2:]   # R moves about gravity
+    y, axes = np.empty(n), known.align1[2:]  # R moves about gravity
     count = 0
     for k in range(found):
         # Two attempts: a pair may be two real roots that the polynomial does not resolve.
@@ -59,14 +59,17 @@ def solve_with_gravity(sample: Sample, known: Knowledge, out: Solutions) -> int:
             common.write_rows(sample, factors, R, A, 0)
             algebra.lu_factor(A, pivots)
             y[:] = 1.0
-            algebra.lu_solve(A, pivots, y)   # one step of inverse iteration
+            algebra.lu_solve(A, pivots, y)  # one step of inverse iteration
             algebra.normalise(y)
             converged = common.polish(sample, factors, axes, R, y, 20)
-            if not converged:   # a conjugate pair: the nearest angle
+            if not converged:  # a conjugate pair: the nearest angle
                 common.rotation_from_yaw(psi, known, R)
                 common.write_nearest_vector(sample, factors, R, y)
-            if (converged or side < 0.0) and not common.is_known(R, out.R[:count]) \
-                    and common.write_solution(sample, factors, R, y, out.x[count]):
+            if (
+                (converged or side < 0.0)
+                and not common.is_known(R, out.R[:count])
+                and common.write_solution(sample, factors, R, y, out.x[count])
+            ):
                 count += 1
             if count == 2 * degree:
                 return count
@@ -75,7 +78,7 @@ def solve_with_gravity(sample: Sample, known: Knowledge, out: Solutions) -> int:
     return count
 
 
-MAX_11PT = MAX_5PT   # one per start
+MAX_11PT = MAX_5PT  # one per start
 
 
 @kernel
@@ -88,7 +91,7 @@ def _reach_rank_8(sample: Sample, factors: common.RowTimeFactors, R: Array, y: A
     axes, R_new, error, damping = np.eye(3), R.copy(), np.inf, 0.1
     system, right, factor = np.zeros((12, 12)), np.empty(12), np.zeros((12, 12))
     hessian, gradient, damped = np.zeros((12, 12)), np.zeros(12), np.eye(12)
-    damped[3:] *= 1e-9   # of y only what Cholesky's method needs
+    damped[3:] *= 1e-9  # of y only what Cholesky's method needs
     for _ in range(30):
         common.write_nearest_vector(sample, factors, R_new, y)
         squares, size2 = common.linearise(sample, factors, axes, R_new, y, system, right)
@@ -122,14 +125,18 @@ def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
     start = Solutions(np.empty((MAX_5PT, 3, 3)), np.zeros((MAX_5PT, 9)))
     so3.copy_matrix(known.rotation, start.R[0])
     if not known.predicted:
-        starts = solve_5pt(Sample(sample.f1[:5], sample.f2[:5], sample.tau1[:5], sample.tau2[:5]),
-                           known, start)
+        starts = solve_5pt(
+            Sample(sample.f1[:5], sample.f2[:5], sample.tau1[:5], sample.tau2[:5]), known, start
+        )
     y = np.empty(9)
     count = 0
     for k in range(starts):
         R = out.R[count]
         so3.copy_matrix(start.R[k], R)
-        if _reach_rank_8(sample, factors, R, y) and not common.is_known(R, out.R[:count]) \
-                and common.write_solution(sample, factors, R, y, out.x[count]):
+        if (
+            _reach_rank_8(sample, factors, R, y)
+            and not common.is_known(R, out.R[:count])
+            and common.write_solution(sample, factors, R, y, out.x[count])
+        ):
             count += 1
     return count

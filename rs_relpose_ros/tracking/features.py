@@ -43,7 +43,9 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     first, last = feature_rows(config, height)
     distance = config.min_feature_distance / scale
     free = np.zeros(image.shape, dtype=np.uint8)
-    free[max(margin, math.ceil(first / scale)):math.floor(last / scale) + 1, margin:-margin] = 255
+    free[max(margin, math.ceil(first / scale)) : math.floor(last / scale) + 1, margin:-margin] = (
+        255
+    )
     free[-margin:] = 0
     _occupy(free, taken / scale, math.ceil(distance))
     points = scale * _strong_corners(image, free, distance, config.feature_quality)
@@ -57,7 +59,8 @@ def _strong_corners(image: Image, free: Image, distance: float, least: float) ->
     `least`: smallest eigenvalue of the structure tensor [gray^2/px^2].
     """
     corners, quality = cv2.goodFeaturesToTrackWithQuality(
-        image, 0, _ALL, distance, free, blockSize=_BLOCK)
+        image, 0, _ALL, distance, free, blockSize=_BLOCK
+    )
     if corners is None:
         return np.empty((0, 2))  # type: ignore[unreachable]
     # OpenCV's value is the mean of (2 dI/dx / 255)^2 over the block.
@@ -73,7 +76,7 @@ def _occupy(free: Image, points: Array, radius: int) -> None:
         x, y = round(points[k, 0]), round(points[k, 1])
         for row in range(max(y - radius, 0), min(y + radius + 1, height)):
             for column in range(max(x - radius, 0), min(x + radius + 1, width)):
-                if (column - x)**2 + (row - y)**2 <= radius * radius:
+                if (column - x) ** 2 + (row - y) ** 2 <= radius * radius:
                     free[row, column] = 0
 
 
@@ -105,17 +108,17 @@ def _spread(points: Array, taken: Array, cell: float) -> NDArray[np.intp]:
     _, starts, sizes = np.unique(cells[by_cell], return_index=True, return_counts=True)
     rank = np.empty(len(both), dtype=np.int64)
     rank[by_cell] = np.arange(len(both)) - np.repeat(starts, sizes)
-    return np.argsort(rank[len(taken):], kind='stable')
+    return np.argsort(rank[len(taken) :], kind='stable')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
     """Corresponding points of the reference keyframe and the current frame; read-only."""
 
-    track_ids: NDArray[np.uint32]   # (N,) the same for the same track in all pairs
-    points1: Array   # (N, 2) raw pixels in the reference keyframe
-    points2: Array   # (N, 2) raw pixels in the current frame
-    quality: Array   # (N,) in [0, 1], higher is better
+    track_ids: NDArray[np.uint32]  # (N,) the same for the same track in all pairs
+    points1: Array  # (N, 2) raw pixels in the reference keyframe
+    points2: Array  # (N, 2) raw pixels in the current frame
+    quality: Array  # (N,) in [0, 1], higher is better
 
     @classmethod
     def none(cls) -> Matches:
@@ -127,8 +130,9 @@ class Matches:
 
     def kept(self, mask: NDArray[np.bool_]) -> Matches:
         """Those of a mask (N,)."""
-        return Matches(self.track_ids[mask], self.points1[mask], self.points2[mask],
-                       self.quality[mask])
+        return Matches(
+            self.track_ids[mask], self.points1[mask], self.points2[mask], self.quality[mask]
+        )
 
 
 class TrackIds:
@@ -204,8 +208,9 @@ class DescriptorTracker:
         """None (0, 2): all keypoints of the next image are compared, at any place."""
         return np.empty((0, 2))
 
-    def track(self, image: Image, predicted: Array | None = None,
-              interval: float = 1.0) -> Matches:
+    def track(
+        self, image: Image, predicted: Array | None = None, interval: float = 1.0
+    ) -> Matches:
         """Match `image`, the new current one, with the reference."""
         if self._reference is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
@@ -215,8 +220,12 @@ class DescriptorTracker:
         # A matched keypoint takes the id of the reference.
         found.ids[indices2] = self._reference.ids[indices1]
         self._current = found
-        self._matches = Matches(self._reference.ids[indices1], self._reference.points[indices1],
-                                found.points[indices2], quality)
+        self._matches = Matches(
+            self._reference.ids[indices1],
+            self._reference.points[indices1],
+            found.points[indices2],
+            quality,
+        )
         self._most = max(self._most, len(self._matches))
         return self._matches
 
@@ -247,11 +256,13 @@ class DescriptorTracker:
         _, once = np.unique(points, axis=0, return_index=True)
         kept = np.sort(once)
         kept = kept[(points[kept, 1] >= first) & (points[kept, 1] <= last)]
-        return _Keypoints(self._ids.take(len(kept)), points[kept],
-                          np.ascontiguousarray(descriptors[kept]))
+        return _Keypoints(
+            self._ids.take(len(kept)), points[kept], np.ascontiguousarray(descriptors[kept])
+        )
 
-    def _match(self, first: _Keypoints,
-               second: _Keypoints) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    def _match(
+        self, first: _Keypoints, second: _Keypoints
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Indices into both and quality: 1 - (best / second best distance)."""
         if len(first.ids) < 2 or len(second.ids) < 2:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
@@ -267,11 +278,13 @@ class DescriptorTracker:
             matched, partners = matched[mutual], partners[mutual]
         return matched, partners, 1.0 - ratio[matched]
 
-    def _nearest(self, first: Descriptors, second: Descriptors,
-                 count: int) -> tuple[Array, NDArray[np.int64]]:
+    def _nearest(
+        self, first: Descriptors, second: Descriptors, count: int
+    ) -> tuple[Array, NDArray[np.int64]]:
         """Distances (N, count) and indices (N, count) of the nearest in `second`."""
-        distances, indices = cv2.batchDistance(first, second, self._depth, normType=self._norm,
-                                               K=count)
+        distances, indices = cv2.batchDistance(
+            first, second, self._depth, normType=self._norm, K=count
+        )
         return distances.astype(np.float64), indices.astype(np.int64)
 
 
@@ -295,8 +308,9 @@ class Tracker(Protocol):
         None (0, 2) if the search is not local and needs no prediction.
         """
 
-    def track(self, image: Image, predicted: Array | None = None,
-              interval: float = 1.0) -> Matches:
+    def track(
+        self, image: Image, predicted: Array | None = None, interval: float = 1.0
+    ) -> Matches:
         """Make `image` (H, W) the current one; its matches with the reference.
 
         `predicted` (N, 2) [px]: expected places of `points` in `image`, NaN if unknown. The part

@@ -43,14 +43,20 @@ class GrayLevels:
     def gray(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """Gray image (H, W) of the next image."""
         low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
-        if (low < self._low or high > self._high
-                or high - low < _LEAST_FILLED * (self._high - self._low) > _LEAST_RANGE):
+        if (
+            low < self._low
+            or high > self._high
+            or high - low < _LEAST_FILLED * (self._high - self._low) > _LEAST_RANGE
+        ):
             spare = _MARGIN * (high - low)
             self._low = max(low - spare, 0.0)
             self._high = max(high + spare, self._low + _LEAST_RANGE)
         scale = 255.0 / (self._high - self._low)
-        return np.asarray(np.clip((pixels - np.float32(self._low)) * np.float32(scale), 0.0, 255.0)
-                          .astype(np.uint8))
+        return np.asarray(
+            np.clip((pixels - np.float32(self._low)) * np.float32(scale), 0.0, 255.0).astype(
+                np.uint8
+            )
+        )
 
 
 def is_dark(image: NDArray[np.uint8]) -> bool:
@@ -63,9 +69,9 @@ def is_dark(image: NDArray[np.uint8]) -> bool:
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 _JPEG_SIGNATURE = b'\xff\xd8\xff'
 # Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC.
-_START_OF_FRAME = frozenset(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers without a length field: TEM and RST0 to RST7.
-_STANDALONE = frozenset({0x01, *range(0xd0, 0xd8)})
+_STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 # Most bytes after the end marker of a JPEG: cameras pad their files.
 _PADDING = 4096
 
@@ -88,10 +94,10 @@ def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
 def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
     at = 2
     while at + 9 <= len(data):
-        if data[at] != 0xff:
+        if data[at] != 0xFF:
             break
         marker = int(data[at + 1])
-        if marker == 0xff:   # fill byte
+        if marker == 0xFF:  # fill byte
             at += 1
         elif marker in _STANDALONE:
             at += 2
@@ -110,7 +116,7 @@ def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
 # -- Encodings ------------------------------------------------------------------------------------
 
 Bytes = NDArray[np.uint8]
-Image = NDArray[np.uint8]   # (H, W) gray
+Image = NDArray[np.uint8]  # (H, W) gray
 
 # Largest side [px] and area [px^2] of an image: far above any camera, far below the memory.
 MAX_IMAGE_SIDE = 16384
@@ -139,14 +145,28 @@ _PLANAR_YUV = ('nv21', 'nv12', 'nv24', 'i420', 'yuv420')
 _GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
 
 # Names of the pixels of a PNG or JPEG file, by their type and number of channels.
-_ENCODED = {('uint8', 1): 'mono8', ('uint8', 3): 'bgr8', ('uint8', 4): 'bgra8',
-            ('uint16', 1): 'mono16', ('uint16', 3): 'bgr16', ('uint16', 4): 'bgra16'}
+_ENCODED = {
+    ('uint8', 1): 'mono8',
+    ('uint8', 3): 'bgr8',
+    ('uint8', 4): 'bgra8',
+    ('uint16', 1): 'mono16',
+    ('uint16', 3): 'bgr16',
+    ('uint16', 4): 'bgra16',
+}
 
 # Two bytes per pixel, of which a camera may fill some bits only.
 _GRAY_16 = ('mono16', '16UC1')
 
-ENCODINGS = ('mono8', '8UC1', *_GRAY_16, *_COLOR, *(f'{name}8' for name in _BAYER),
-             *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
+ENCODINGS = (
+    'mono8',
+    '8UC1',
+    *_GRAY_16,
+    *_COLOR,
+    *(f'{name}8' for name in _BAYER),
+    *(f'{name}16' for name in _BAYER),
+    *_PACKED_YUV,
+    *_PLANAR_YUV,
+)
 
 
 class Pixels(NamedTuple):
@@ -166,7 +186,7 @@ class RawImage:
     height: int
     step: int
     is_bigendian: bool
-    stamp_ns: int = 0   # this and frame_id: of the header
+    stamp_ns: int = 0  # this and frame_id: of the header
     frame_id: str = ''
 
     is_png: ClassVar[bool] = False
@@ -175,8 +195,16 @@ class RawImage:
     def of_gray(cls, image: Image, stamp_ns: int, frame_id: str = '') -> Self:
         """A mono8 image of an array (H, W)."""
         height, width = image.shape
-        return cls(np.ascontiguousarray(image).ravel(), 'mono8', width, height, width, False,
-                   stamp_ns, frame_id)
+        return cls(
+            np.ascontiguousarray(image).ravel(),
+            'mono8',
+            width,
+            height,
+            width,
+            False,
+            stamp_ns,
+            frame_id,
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -196,11 +224,12 @@ class RawImage:
         if encoding in _COLOR:
             return np.asarray(cv2.cvtColor(self._colors(), _COLOR[encoding][1]), dtype=np.uint8)
         if encoding in _PACKED_YUV:
-            return np.ascontiguousarray(self._rows(2)[:, _PACKED_YUV[encoding]::2])
+            return np.ascontiguousarray(self._rows(2)[:, _PACKED_YUV[encoding] :: 2])
         if encoding in ENCODINGS:
             return self._from_bayer(levels)
-        raise InputError(f'image encoding {encoding[:40]!r} is not known; '
-                         f'publish one of {", ".join(ENCODINGS)}')
+        raise InputError(
+            f'image encoding {encoding[:40]!r} is not known; publish one of {", ".join(ENCODINGS)}'
+        )
 
     def pixels(self, levels: GrayLevels | None = None) -> Pixels:
         """The image in its own encoding; gray, as `decoded`, for Bayer and YUV."""
@@ -212,11 +241,9 @@ class RawImage:
 
     def _from_bayer(self, levels: GrayLevels) -> Image:
         if self.height < 3 or self.width < 3:
-            raise InputError(
-                f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
+            raise InputError(f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
         pattern = self.encoding.removesuffix('16').removesuffix('8')
-        mosaic = (levels.gray(self._two_bytes()) if self.encoding.endswith('16')
-                  else self._rows(1))
+        mosaic = levels.gray(self._two_bytes()) if self.encoding.endswith('16') else self._rows(1)
         return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
 
     def _two_bytes(self) -> NDArray[np.uint16]:
@@ -233,15 +260,21 @@ class RawImage:
         check_image_size(self.width, self.height)
         height, step, row_bytes = self.height, self.step, bytes_per_pixel * self.width
         if step < row_bytes:
-            raise InputError(f'image step is {step} bytes, but a row of {self.width} px in '
-                             f'{self.encoding} has {row_bytes}')
+            raise InputError(
+                f'image step is {step} bytes, but a row of {self.width} px in '
+                f'{self.encoding} has {row_bytes}'
+            )
         needed = step * (height - 1) + row_bytes
         if len(self.data) < needed:
             raise InputError(
                 f'image has {len(self.data)} bytes of data, but {self.width}x{height} in '
-                f'{self.encoding} with step {step} needs {needed}')
-        return np.ascontiguousarray(np.lib.stride_tricks.as_strided(
-            self.data, shape=(height, row_bytes), strides=(step, 1), writeable=False))
+                f'{self.encoding} with step {step} needs {needed}'
+            )
+        return np.ascontiguousarray(
+            np.lib.stride_tricks.as_strided(
+                self.data, shape=(height, row_bytes), strides=(step, 1), writeable=False
+            )
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,7 +283,7 @@ class CompressedImage:
 
     data: Bytes
     encoding: str
-    stamp_ns: int = 0   # as of `RawImage`
+    stamp_ns: int = 0  # as of `RawImage`
     frame_id: str = ''
 
     @property
@@ -261,13 +294,14 @@ class CompressedImage:
     @property
     def is_png(self) -> bool:
         """Whether it is a PNG file, which is lossless."""
-        return self.data[:len(_PNG_SIGNATURE)].tobytes() == _PNG_SIGNATURE
+        return self.data[: len(_PNG_SIGNATURE)].tobytes() == _PNG_SIGNATURE
 
     def decoded(self, levels: GrayLevels | None = None) -> Image:
         """Gray image (H, W); `levels` as of `RawImage.decoded`."""
         # EXIF orientation is ignored: rows must stay in the order of the readout.
-        image = _decoded(self.data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-                         | cv2.IMREAD_ANYDEPTH)
+        image = _decoded(
+            self.data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+        )
         if image.dtype == np.uint16:
             return (levels or GrayLevels()).gray(image)
         return np.asarray(image, dtype=np.uint8)
@@ -278,9 +312,12 @@ class CompressedImage:
         channels = 1 if image.ndim == 2 else image.shape[2]
         encoding = _ENCODED.get((image.dtype.name, channels))
         if encoding is None:
-            raise InputError(f'compressed image has {channels} channels of {image.dtype.name}: '
-                             f'publish one of {", ".join(_ENCODED.values())}')
+            raise InputError(
+                f'compressed image has {channels} channels of {image.dtype.name}: '
+                f'publish one of {", ".join(_ENCODED.values())}'
+            )
         return Pixels(image, encoding)
+
 
 def _decoded(data: Bytes, flags: int) -> NDArray[Any]:
     """Pixels of a JPEG or PNG file; `flags` of cv2.imdecode."""
@@ -291,8 +328,7 @@ def _decoded(data: Bytes, flags: int) -> NDArray[Any]:
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != (height, width):
-        raise InputError(
-            f'compressed image of {len(data)} bytes cannot be decoded: it is corrupt')
+        raise InputError(f'compressed image of {len(data)} bytes cannot be decoded: it is corrupt')
     return np.asarray(image)
 
 
@@ -301,10 +337,15 @@ EncodedImage = RawImage | CompressedImage
 
 def check_image_size(width: int, height: int) -> None:
     """Raise InputError for an impossible size."""
-    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
-            and width * height <= MAX_IMAGE_PIXELS):
-        raise InputError(f'image size {width}x{height} is not usable: sides must be 1 to '
-                         f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px')
+    if not (
+        0 < width <= MAX_IMAGE_SIDE
+        and 0 < height <= MAX_IMAGE_SIDE
+        and width * height <= MAX_IMAGE_PIXELS
+    ):
+        raise InputError(
+            f'image size {width}x{height} is not usable: sides must be 1 to '
+            f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px'
+        )
 
 
 def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
@@ -315,12 +356,14 @@ def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
     """
     image = np.ascontiguousarray(image)
     if image.ndim != 2 or image.dtype != np.uint8 or image.size == 0:
-        raise InputError('image must be (H, W) of uint8 and not empty, '
-                         f'got {image.shape} of {image.dtype}')
+        raise InputError(
+            f'image must be (H, W) of uint8 and not empty, got {image.shape} of {image.dtype}'
+        )
     if shape is not None and image.shape != shape:
         raise InputError(
             f'image size changed from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]} '
-            'in mid-stream: reset the tracker first')
+            'in mid-stream: reset the tracker first'
+        )
     image = image.view()
     image.flags.writeable = False
     return image

@@ -49,13 +49,20 @@ _LARGEST_STRETCH = 4.0
 class Flow(NamedTuple):
     """Points tracked into a second image."""
 
-    points: Array   # (N, 2) in the second image
-    found: NDArray[np.bool_]   # (N,)
-    strength: Array   # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
+    points: Array  # (N, 2) in the second image
+    found: NDArray[np.bool_]  # (N,)
+    strength: Array  # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
 
 
-def follow(image1: Image, image2: Image, points1: Array, guess: Array, side: int, levels: int,
-           criteria: Criteria) -> Flow:
+def follow(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    guess: Array,
+    side: int,
+    levels: int,
+    criteria: Criteria,
+) -> Flow:
     """Points of `image2` near the `guess` (N, 2) that match `points1` (N, 2) of `image1`.
 
     `side` [px] of the windows; `levels` of the pyramid, 1 for the original images only.
@@ -63,11 +70,18 @@ def follow(image1: Image, image2: Image, points1: Array, guess: Array, side: int
     if not len(points1):
         return Flow(points1, np.empty(0, dtype=bool), np.empty(0))
     radius = patch_radius(side, _REACH)
-    if levels <= 2 and image1.size > _WORTH * len(points1) * (2 * radius + 1)**2:
+    if levels <= 2 and image1.size > _WORTH * len(points1) * (2 * radius + 1) ** 2:
         if levels == 2:
             # As in a pyramid: the coarse level gives the start of the fine one.
-            coarse = _near(cv2.pyrDown(image1), cv2.pyrDown(image2),  # type: ignore[arg-type]
-                           0.5 * points1, 0.5 * guess, side, radius, criteria)
+            coarse = _near(
+                cv2.pyrDown(image1),  # type: ignore[arg-type]
+                cv2.pyrDown(image2),  # type: ignore[arg-type]
+                0.5 * points1,
+                0.5 * guess,
+                side,
+                radius,
+                criteria,
+            )
             guess = np.where(coarse.found[:, None], 2.0 * coarse.points, guess)
         flow = _near(image1, image2, points1, guess, side, radius, criteria)
     else:
@@ -87,23 +101,47 @@ def patch_radius(side: int, reach: int) -> int:
     return side // 2 + reach + _FRINGE
 
 
-def whole_images(image1: Image, image2: Image, points1: Array, guess: Array, side: int,
-                 levels: int, criteria: Criteria) -> Flow:
+def whole_images(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    guess: Array,
+    side: int,
+    levels: int,
+    criteria: Criteria,
+) -> Flow:
     """`follow` by OpenCV on whole images, over any distance."""
     points2, status, eigenvalues = cv2.calcOpticalFlowPyrLK(
-        image1, image2, points1.astype(np.float32, order='C'),
-        guess.astype(np.float32, order='C'), winSize=(side, side), maxLevel=levels - 1,
-        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-    return Flow(np.asarray(points2, dtype=np.float64), np.asarray(status)[:, 0] == 1,
-                _SCHARR * np.asarray(eigenvalues, dtype=np.float64)[:, 0])
+        image1,
+        image2,
+        points1.astype(np.float32, order='C'),
+        guess.astype(np.float32, order='C'),
+        winSize=(side, side),
+        maxLevel=levels - 1,
+        criteria=criteria,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
+    )
+    return Flow(
+        np.asarray(points2, dtype=np.float64),
+        np.asarray(status)[:, 0] == 1,
+        _SCHARR * np.asarray(eigenvalues, dtype=np.float64)[:, 0],
+    )
 
 
-def _near(image1: Image, image2: Image, points1: Array, guess: Array, side: int, radius: int,
-          criteria: Criteria) -> Flow:
+def _near(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    guess: Array,
+    side: int,
+    radius: int,
+    criteria: Criteria,
+) -> Flow:
     """`follow` on patches, which end `_REACH` pixels from the guess."""
     first, second = windows.cut(image1, points1, radius), windows.cut(image2, guess, radius)
-    flow = whole_images(first.image, second.image, points1 + first.shifts,
-                        guess + second.shifts, side, 1, criteria)
+    flow = whole_images(
+        first.image, second.image, points1 + first.shifts, guess + second.shifts, side, 1, criteria
+    )
     points2 = flow.points - second.shifts
     near = (np.abs(points2 - guess) <= _REACH).all(axis=1)
     return Flow(points2, flow.found & near, flow.strength)
@@ -112,8 +150,10 @@ def _near(image1: Image, image2: Image, points1: Array, guess: Array, side: int,
 # -- Alignment removes the drift of a track: the error of one alignment is left. The current image
 # -- is resampled to the geometry of the reference, by a homography fitted to the tracks.
 
-def aligned(matches: Matches, reference: Image, current: Image,
-            config: TrackingConfig) -> tuple[Matches, NDArray[np.bool_]]:
+
+def aligned(
+    matches: Matches, reference: Image, current: Image, config: TrackingConfig
+) -> tuple[Matches, NDArray[np.bool_]]:
     """`matches` (N) with their second points aligned, and a mask (N,) of those that correlate."""
     points1, points2, side = matches.points1, matches.points2, config.klt_window
     radius = patch_radius(side, math.ceil(_LARGEST_CORRECTION))
@@ -121,7 +161,8 @@ def aligned(matches: Matches, reference: Image, current: Image,
     there = windows.cut_warped(current, points2, jacobians, radius, points1)
     here = windows.cut(reference, points1, radius)
     image = windows.with_brightness(
-        there.image, windows.brightness_table(reference, current, points1, points2, side))
+        there.image, windows.brightness_table(reference, current, points1, points2, side)
+    )
     start = points1 + here.shifts
     flow = whole_images(here.image, image, start, start, side, 1, _ALIGNMENT_CRITERIA)
     # From the pixels of the reference to those of the current image: p2 + J (x - p1).
@@ -129,9 +170,12 @@ def aligned(matches: Matches, reference: Image, current: Image,
     found = points2 + correction
     correlation = windows.correlations(here.image, image, start, flow.points, side)
     # Patches repeat the border of the image: a match there is not in the image.
-    good = (flow.found & inside(current, found, side // 4)
-            & (correlation >= config.min_correlation)
-            & (np.linalg.norm(correction, axis=1) <= _LARGEST_CORRECTION))
+    good = (
+        flow.found
+        & inside(current, found, side // 4)
+        & (correlation >= config.min_correlation)
+        & (np.linalg.norm(correction, axis=1) <= _LARGEST_CORRECTION)
+    )
     # At equal correlation a faint corner ranks behind a strong one.
     quality = correlation * flow.strength / (flow.strength + config.feature_quality)
     return replace(matches, points2=found, quality=quality), good
@@ -146,8 +190,7 @@ def window_homography(points1: Array, points2: Array) -> Array:
         return np.eye(3)
     # Without a solution OpenCV returns None: an array without shape.
     some = slice(None, None, -(-len(points1) // _FITTED))
-    H = np.asarray(cv2.findHomography(points1[some], points2[some], method=0)[0],
-                   dtype=np.float64)
+    H = np.asarray(cv2.findHomography(points1[some], points2[some], method=0)[0], dtype=np.float64)
     if H.shape != (3, 3) or not np.isfinite(H).all():
         return np.eye(3)
     scale = points1 @ H[2, :2] + H[2, 2]
@@ -211,8 +254,9 @@ class KltTracker:
         self._current = image
         self.promote()
 
-    def track(self, image: Image, predicted: Array | None = None,
-              interval: float = 1.0) -> Matches:
+    def track(
+        self, image: Image, predicted: Array | None = None, interval: float = 1.0
+    ) -> Matches:
         """Follow the corners into `image`, the new current one; see `Tracker.track`."""
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
@@ -221,21 +265,26 @@ class KltTracker:
         expected = predicted is not None or bool(self._unexplained.any())
         predicted = points if predicted is None else _usable(predicted, points, image.shape)
         guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
-        observed = windows.with_brightness(current, windows.brightness_table(
-            previous, current, points, guess, self._config.klt_window))
+        observed = windows.with_brightness(
+            current,
+            windows.brightness_table(previous, current, points, guess, self._config.klt_window),
+        )
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
         found, good = self._follow_and_return(previous, observed, points, guess, levels)
         # Many losses: the motion was not the expected one. Losses of most: nor the predicted one.
-        for start, most, wanted in ((predicted, _MOST_LOST, levels < all_levels),
-                                    (points, _HOPELESS, predicted is not points)):
+        for start, most, wanted in (
+            (predicted, _MOST_LOST, levels < all_levels),
+            (points, _HOPELESS, predicted is not points),
+        ):
             lost = ~good
             if wanted and np.count_nonzero(lost) > most * len(good):
                 found[lost], good[lost] = self._follow_and_return(
-                    previous, observed, points[lost], start[lost], all_levels)
+                    previous, observed, points[lost], start[lost], all_levels
+                )
         off = found[good] - guess[good]
-        far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR)**2)
+        far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR) ** 2)
         self._guesses_near = bool(far <= _MOST_FAR * len(off))
         first, last = features.feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
@@ -246,8 +295,13 @@ class KltTracker:
 
     def refined_matches(self) -> Matches:
         """Matches with windows aligned to those of the reference."""
-        if (not self._refined and len(self._matches) and self._reference is not None
-                and self._current is not None and self._current is not self._reference):
+        if (
+            not self._refined
+            and len(self._matches)
+            and self._reference is not None
+            and self._current is not None
+            and self._current is not self._reference
+        ):
             refined, good = aligned(self._matches, self._reference, self._current, self._config)
             self._set(refined, self._unexplained, good)
         self._refined = True
@@ -260,12 +314,16 @@ class KltTracker:
         # Of tracks that merged the oldest is kept.
         apart = features.keep_apart(self.points, 0.5 * self._config.min_feature_distance)
         kept = self.points[apart]
-        new = features.find_corners(self._current, kept, self._config.max_features - len(kept),
-                                    self._config)
+        new = features.find_corners(
+            self._current, kept, self._config.max_features - len(kept), self._config
+        )
         points = np.concatenate([kept, new])
         self._matches = Matches(
             np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))]),
-            points, points, np.ones(len(points)))
+            points,
+            points,
+            np.ones(len(points)),
+        )
         self._unexplained = np.concatenate([self._unexplained[apart], np.zeros_like(new)])
         self._started = len(points)
         # The parallax of new corners is not known.
@@ -278,28 +336,46 @@ class KltTracker:
     def _set(self, matches: Matches, unexplained: Array, good: NDArray[np.bool_]) -> None:
         self._matches, self._unexplained = matches.kept(good), unexplained[good]
 
-    def _follow_and_return(self, image1: Image, image2: Image, points1: Array, guess: Array,
-                           levels: int) -> tuple[Array, NDArray[np.bool_]]:
+    def _follow_and_return(
+        self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Points of `image2` that match `points1` (N, 2), and a mask of those tracked back."""
-        there = follow(image1, image2, points1, guess, self._config.klt_window, levels,
-                       _TRACKING_CRITERIA)
+        there = follow(
+            image1, image2, points1, guess, self._config.klt_window, levels, _TRACKING_CRITERIA
+        )
         # The way back starts as far off as the way forth: the guess must not be the answer.
         offset = there.points - guess
         good = there.found.copy()
-        good[good] = self._return(image2, image1, there.points[good], points1[good],
-                                  offset[good], 1)
+        good[good] = self._return(
+            image2, image1, there.points[good], points1[good], offset[good], 1
+        )
         # Without a pyramid near points are tracked back, and some of the far ones.
         far = there.found & ~good & (np.linalg.norm(offset, axis=1) > _NEAR)
         if levels > 1 and far.any():
-            good[far] = self._return(image2, image1, there.points[far], points1[far],
-                                     offset[far], levels)
+            good[far] = self._return(
+                image2, image1, there.points[far], points1[far], offset[far], levels
+            )
         return there.points, good
 
-    def _return(self, image2: Image, image1: Image, found: Array, points1: Array, offset: Array,
-                levels: int) -> NDArray[np.bool_]:
+    def _return(
+        self,
+        image2: Image,
+        image1: Image,
+        found: Array,
+        points1: Array,
+        offset: Array,
+        levels: int,
+    ) -> NDArray[np.bool_]:
         """Mask of the `found` points tracked back to `points1` from a guess off by `offset`."""
-        back = follow(image2, image1, found, points1 + offset, self._config.klt_window, levels,
-                      _TRACKING_CRITERIA)
+        back = follow(
+            image2,
+            image1,
+            found,
+            points1 + offset,
+            self._config.klt_window,
+            levels,
+            _TRACKING_CRITERIA,
+        )
         error = np.linalg.norm(back.points - points1, axis=1)
         return back.found & (error <= self._config.forward_backward_threshold)
 
@@ -310,5 +386,5 @@ def _usable(guess: Array, otherwise: Array, shape: tuple[int, ...]) -> Array:
     A gyro in a wrong unit predicts points anywhere, which overflow as pixels.
     """
     size = np.array(shape[1::-1])
-    near = np.abs(guess - 0.5 * size) <= 1.5 * size   # False for NaN
+    near = np.abs(guess - 0.5 * size) <= 1.5 * size  # False for NaN
     return np.where(near.all(axis=1, keepdims=True), guess, otherwise)

@@ -26,12 +26,12 @@ _FARTHEST = 1e6
 class Patches:
     """Square patches of one image."""
 
-    image: Image   # patch by patch, in rows
+    image: Image  # patch by patch, in rows
     # (N, 2), row k added to a point [px] near the centre of patch k gives its place in `image`
     shifts: Array
 
     def __post_init__(self) -> None:
-        self.image.flags.writeable = False   # as images are: see `images.checked`
+        self.image.flags.writeable = False  # as images are: see `images.checked`
 
 
 def cut(image: Image, points: Array, radius: int) -> Patches:
@@ -45,8 +45,9 @@ def cut(image: Image, points: Array, radius: int) -> Patches:
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
-def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
-               points1: Array) -> Patches:
+def cut_warped(
+    image: Image, points: Array, jacobians: Array, radius: int, points1: Array
+) -> Patches:
     """Patches of this image, resampled to the geometry of another one.
 
     Pixel x of patch k, in the other image, has the value of this image at ``points + J (x -
@@ -59,7 +60,8 @@ def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
     x, y = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     _maps(points, jacobians, centres - points1, side, corners, x, y)
     mosaic: Image = cv2.remap(  # type: ignore[assignment]
-        image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
@@ -72,8 +74,9 @@ def _layout(count: int, side: int) -> tuple[tuple[int, int], NDArray[np.int64]]:
 
 
 @kernel
-def _copy(image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64],
-          mosaic: Image) -> None:
+def _copy(
+    image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64], mosaic: Image
+) -> None:
     height, width = image.shape
     rows, columns = mosaic.shape
     pixels, target = image.reshape(height * width), mosaic.reshape(rows * columns)
@@ -96,8 +99,15 @@ def _copy(image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np
 
 
 @kernel
-def _maps(points: Array, jacobians: Array, offsets: Array, side: int,
-          corners: NDArray[np.int64], x: Map, y: Map) -> None:
+def _maps(
+    points: Array,
+    jacobians: Array,
+    offsets: Array,
+    side: int,
+    corners: NDArray[np.int64],
+    x: Map,
+    y: Map,
+) -> None:
     """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
     radius = side // 2
     for k in range(len(points)):
@@ -105,11 +115,9 @@ def _maps(points: Array, jacobians: Array, offsets: Array, side: int,
         column, row = corners[k, 0], corners[k, 1]
         for i in range(side):
             across, down = offsets[k, 0] - radius, offsets[k, 1] + i - radius
-            x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across
-                            + jacobians[k, 0, 1] * down)
-            y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across
-                            + jacobians[k, 1, 1] * down)
-            xs, ys = x[row + i, column:column + side], y[row + i, column:column + side]
+            x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across + jacobians[k, 0, 1] * down)
+            y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across + jacobians[k, 1, 1] * down)
+            xs, ys = x[row + i, column : column + side], y[row + i, column : column + side]
             for j in range(side):
                 xs[j] = x0 + a * np.float32(j)
                 ys[j] = y0 + c * np.float32(j)
@@ -136,8 +144,7 @@ _LANES = 8
 
 
 @kernel
-def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
-                 side: int) -> Array:
+def correlations(image1: Image, image2: Image, points1: Array, points2: Array, side: int) -> Array:
     """Normalised cross-correlation (N,) of the windows around matched points (N, 2).
 
     Zero where one of the windows is flat; the border is repeated.
@@ -180,15 +187,23 @@ def _sample(square: Image, shift: Array, window: Window, by_column: Window) -> f
     side, padded = window.shape
     dx, dy = shift[0], shift[1]
     # Weights of the four pixels around a sample: the same for all, as they lie on a grid.
-    w00, w01, w10, w11 = (np.float32((1.0 - dx) * (1.0 - dy)), np.float32(dx * (1.0 - dy)),
-                          np.float32((1.0 - dx) * dy), np.float32(dx * dy))
+    w00, w01, w10, w11 = (
+        np.float32((1.0 - dx) * (1.0 - dy)),
+        np.float32(dx * (1.0 - dy)),
+        np.float32((1.0 - dx) * dy),
+        np.float32(dx * dy),
+    )
     by_column[:] = 0.0
     for i in range(side):
         above, below, row = square[i], square[i + 1], window[i]
         above1, below1 = above[1:], below[1:]
         for j in range(padded):
-            value = (w00 * np.float32(above[j]) + w01 * np.float32(above1[j])
-                     + w10 * np.float32(below[j]) + w11 * np.float32(below1[j]))
+            value = (
+                w00 * np.float32(above[j])
+                + w01 * np.float32(above1[j])
+                + w10 * np.float32(below[j])
+                + w11 * np.float32(below1[j])
+            )
             row[j] = value
             by_column[j] += value
     return _total(by_column, side)
@@ -210,8 +225,9 @@ def _total(by_column: Window, side: int) -> float:
 _LEAST_GAIN, _LEAST_OFFSET = 0.1, 10.0
 
 
-def brightness_table(image1: Image, image2: Image, points1: Array, points2: Array,
-                     side: int) -> Image | None:
+def brightness_table(
+    image1: Image, image2: Image, points1: Array, points2: Array, side: int
+) -> Image | None:
     """Gray level of the first image for each one of the second (256,); None if they agree.
 
     Windows of `side` pixels around matches (N, 2) are compared in the original images:
