@@ -26,6 +26,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
     ROTATION,
     Unknowns,
 )
+from rs_relpose_ros.core.losses import geman_mcclure_weight, robust_scale
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
 
@@ -339,7 +340,7 @@ def fit(
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
     limits = model.ROBUST * unknowns.noise[problem.pair]
-    weights = np.asarray((1.0 + (evaluation.residuals / limits) ** 2) ** -2)
+    weights = np.asarray(geman_mcclure_weight((evaluation.residuals / limits) ** 2))
     covariance = np.zeros((GLOBAL, GLOBAL))
     covariance[np.ix_(free, free)] = jackknife(
         evaluation.score[:, free],
@@ -469,12 +470,12 @@ def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
 
 def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
     """Noise (P,) of each pair by its residuals [px]; a third of the last at least."""
-    counts = np.diff(problem.begin)
-    # Some two unknowns of each pair hide a part of it.
-    noise = (
-        1.4826
-        * _medians(problem, np.abs(at.evaluation.residuals))
-        * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
+    # Some three unknowns of each pair hide a part of it.
+    noise = np.array(
+        [
+            robust_scale(at.evaluation.residuals[begin:end], 0.0, 3.0)
+            for begin, end in itertools.pairwise(problem.begin)
+        ]
     )
     middle = max(float(np.median(noise)), _LEAST_NOISE)
     return np.maximum(

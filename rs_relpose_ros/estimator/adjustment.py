@@ -25,6 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.losses import cauchy_cost, cauchy_weight
+from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.estimator.priors import inverse
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
@@ -192,14 +194,9 @@ def start_of_tracks(tracks: Tracks, R: Array, t: Array) -> Array:
             for k in range(6):
                 track[COLUMNS + k, i] = columns[k]
             h = rotated(R, (last[b, RAY, i], last[b, RAY + 1, i], last[b, RAY + 2, i]))
-            normal = cross(f, h)
-            squared, by_h, by_f = (
-                dot(normal, normal),
-                dot(cross(t, h), normal),
-                dot(cross(t, f), normal),
-            )
-            usable = squared > _PARALLEL and by_h > 0.0 and by_f > 0.0
-            track[INVERSE_DISTANCE, i] = squared / by_h if usable else _FAR
+            along_f, along_h, squared = scaled_depths(f, h, (t[0], t[1], t[2]))
+            usable = squared > _PARALLEL and along_f > 0.0 and along_h > 0.0
+            track[INVERSE_DISTANCE, i] = squared / along_f if usable else _FAR
     return out
 
 
@@ -474,9 +471,9 @@ def _cost(normal: Normal, tracks: Tracks, sigma: float) -> tuple[float, float]:
     used, squares = tracks.used.ravel(), normal.squares.ravel()
     for i in range(len(used)):
         if used[i]:
-            square = 0.25 * squares[i] / (sigma * sigma)
-            cost += 4.0 * math.log(1.0 + square)
-            weighted += 4.0 * square / (1.0 + square)
+            q = 0.25 * squares[i] / (sigma * sigma)
+            cost += 4.0 * cauchy_cost(q)
+            weighted += 4.0 * q * cauchy_weight(q)
             count += 1
     return cost, weighted / count
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core import losses
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
 from rs_relpose_ros.estimator.priors import DW1, PARAMETERS, Priors, SCALE, THETA, TwoViewState
@@ -123,7 +124,7 @@ def score_of_matches(
             for j in range(n):
                 total[i, j] += adjusted[i] * adjusted[j]
     # Noise by the residuals alone, without the configured sigma: (units of sigma)^2.
-    variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - sampson.FITTED, 0.0))
+    variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - losses.FITTED, 0.0))
     share = filled / (filled + HESSIAN_REGIONS)
     return share * total + (1.0 - share) * variance * data_hessian
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig
+from rs_relpose_ros.core.losses import Flags, noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import (
     covariance,
@@ -24,7 +25,7 @@ from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import build_problem, to_reference_row, TwoViewProblem
 from rs_relpose_ros.estimator.result import landmarks, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import SolverMode
-from rs_relpose_ros.estimator.sampson import Flags, RayMatches
+from rs_relpose_ros.estimator.sampson import RayMatches
 from rs_relpose_ros.estimator.velocity import Refined
 from rs_relpose_ros.geometry import Array, so3, validate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -582,7 +583,7 @@ class Estimation:
         if not self.mode.model.derotated:
             return None
         state, observations = refined.state, self.problem.observations
-        weights, sigma = sampson.noise_mixture(
+        weights, sigma = noise_mixture(
             sampson.residuals(observations, state), refined.inliers, self.config.pixel_sigma
         )
         return covariance.image_information(

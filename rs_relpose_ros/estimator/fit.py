@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
 from rs_relpose_ros.geometry import Array, so3
@@ -232,7 +233,7 @@ def fit_rotation(
             o = observations[i]
             h = so3.rotated(R, o[9:12])
             d = (o[0] - h[0], o[1] - h[1], o[2] - h[2])
-            w = weight / (1.0 + weight * so3.dot(d, d) / scale2)
+            w = weight * cauchy_weight(weight * so3.dot(d, d) / scale2)
             # d(f_1 - h) = -theta x h: gradient -(h x (f_1 - h)), Hessian |h|^2 I - h h^T
             turn = so3.cross(h, d)
             for j in range(3):

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.triangulate import depths_of_rays
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import cross, dot, skew
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.geometry.so3 import skew
 
 
 class Status(str, Enum):
@@ -210,29 +210,6 @@ class RelativePose:
 
 # Squared sine of the angle below which rays are parallel: 2e-4 rad, a tenth of a pixel.
 _PARALLEL = 4e-8
-
-
-@kernel
-def depths_of_rays(
-    f1: Array, f2: Array, baselines: Array, parallel: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Depths l (N,) of ``l_1 f_1 = b + l_2 f_2`` by least squares, and whether they are usable.
-
-    Rays (N, 3) are in one frame. Not usable (1) behind a camera, or if the squared sine of the
-    angle between the rays is at most `parallel`.
-    """
-    l1, l2, usable = np.ones(len(f1)), np.ones(len(f1)), np.zeros(len(f1), dtype=np.bool_)
-    for i in range(len(f1)):
-        normal = cross(f1[i], f2[i])
-        squared = dot(normal, normal)
-        # The cross products of that equation with f_2 and f_1.
-        by_f2, by_f1 = (
-            dot(cross(baselines[i], f2[i]), normal),
-            dot(cross(baselines[i], f1[i]), normal),
-        )
-        if squared > parallel and by_f2 > 0.0 and by_f1 > 0.0:
-            l1[i], l2[i], usable[i] = by_f2 / squared, by_f1 / squared, True
-    return l1, l2, usable
 
 
 class Landmarks(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig
+from rs_relpose_ros.core.losses import cauchy_cost, cauchy_weight, robust_scale, truncated_cost
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.fit import fit_rotation, FitMatches, gauss_newton, transfer_errors
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState
@@ -84,9 +85,9 @@ def multi_scale_cost(
             value = x1 * gx + y1 * gy + gz
             r2 = value * value / (gx * gx + gy * gy + kx * kx + ky * ky + 1e-30)
             # False for NaN, which counts as an outlier.
-            cost += r2 * narrow if r2 * narrow < 1.0 else 1.0
-            cost += r2 * middle if r2 * middle < 1.0 else 1.0
-            cost += r2 * wide if r2 * wide < 1.0 else 1.0
+            cost += truncated_cost(r2 * narrow, 1.0)
+            cost += truncated_cost(r2 * middle, 1.0)
+            cost += truncated_cost(r2 * wide, 1.0)
             inliers += 1 if r2 * middle < 1.0 else 0
         if cost > limit:
             return math.inf, 0
@@ -376,7 +377,7 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
     cost = 0.0
     for i in range(r.shape[0]):
         if valid[i]:
-            cost += min(r[i] * r[i], threshold * threshold)
+            cost += truncated_cost(r[i] * r[i], threshold * threshold)
     return cost / (sigma * sigma)
 
 
@@ -446,7 +447,7 @@ _LEAST_SCALE = 0.05  # of residuals [px]
 def _unlikelihood(r: Array) -> float:
     """Negative log-likelihood of residuals (N,), Cauchy about zero with their median as scale."""
     scale = max(so3.median(np.abs(r)), _LEAST_SCALE)
-    return len(r) * math.log(scale) + np.log(1.0 + (r / scale) ** 2).sum()
+    return len(r) * math.log(scale) + cauchy_cost((r / scale) ** 2).sum()
 
 
 def gain_without_gyro(
@@ -475,8 +476,8 @@ def gain_without_gyro(
         gain = known - _unlikelihood(r)
         if k == _FREE_ROUNDS or (k == _PROMISING and gain < 0.0):
             break
-        sigma = max(1.4826 * so3.median(np.abs(r)), _LEAST_SCALE)
-        weights = 1.0 / (1.0 + (r / (_FREE_SIGMAS * sigma)) ** 2)
+        sigma = robust_scale(r, _LEAST_SCALE, 0.0)
+        weights = cauchy_weight((r / (_FREE_SIGMAS * sigma)) ** 2)
         state = gauss_newton(FitMatches(observations, weights, sigma), state, free, _FREE_STEPS)
     return gain, state.R
 

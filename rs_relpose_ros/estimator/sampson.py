@@ -21,8 +21,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_relpose_ros.core.losses import Flags
+from rs_relpose_ros.core.triangulate import depths
 from rs_relpose_ros.estimator.priors import PARAMETERS, TwoViewState
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
@@ -238,8 +239,8 @@ def triangulated(
 ) -> tuple[float, float, float, float]:
     """Depths of match i along both rays [baselines], its parallax [rad] and length of baseline.
 
-    ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1, each
-    match with its own row times; depths are NaN if the rays are parallel.
+    The baseline lies between the places of the camera at the two rows of the match. Depths are
+    NaN if the rays are parallel.
     """
     o = observations[i]
     tau1, tau2 = o[18], o[19]
@@ -249,23 +250,11 @@ def triangulated(
         t[1] - tau1 * d1[1] + tau2 * d2[1],
         t[2] - tau1 * d1[2] + tau2 * d2[2],
     )
-    f, h = o[0:3], so3.rotated(state.R, o[9:12])
-    n = so3.cross(f, h)
-    n2 = so3.dot(n, n)
-    baseline = so3.norm(b)
-    if n2 < 1e-18:
-        return math.nan, math.nan, 0.0, baseline
-    return (
-        so3.dot(so3.cross(b, h), n) / n2,
-        so3.dot(so3.cross(b, f), n) / n2,
-        math.sqrt(n2),
-        baseline,
-    )
+    depth1, depth2, parallax = depths(o[0:3], so3.rotated(state.R, o[9:12]), b)
+    return depth1, depth2, parallax, so3.norm(b)
 
 
 # -- Inliers of a state: by residuals and by depths -----------------------------------------------
-
-Flags = NDArray[np.bool_]
 
 # A depth is tested only if the parallax is this many times its noise.
 SIGNIFICANT_PARALLAX = 4.0
@@ -326,7 +315,7 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
     n = len(r)
     use = np.empty(n, dtype=np.bool_)
     # Depths in units of the distance between the camera's places at the two rows; NaN: untested.
-    depths, known, count = np.full(n, np.nan), np.empty(n), 0
+    relative, known, count = np.full(n, np.nan), np.empty(n), 0
     for i in range(n):
         use[i] = matches.valid[i] and abs(r[i]) < threshold
         if not use[i]:
@@ -337,7 +326,7 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
         if depth1 <= 0.0 or depth2 <= 0.0:
             use[i] = False
             continue
-        depths[i] = known[count] = min(depth1, depth2) / baseline
+        relative[i] = known[count] = min(depth1, depth2) / baseline
         count += 1
     if count < 8:
         return use
@@ -352,7 +341,7 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
     lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
     highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
     for i in range(n):
-        if depths[i] < lowest or depths[i] > highest:
+        if relative[i] < lowest or relative[i] > highest:
             use[i] = False
     return use
 
@@ -361,59 +350,3 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
 def select_inliers(matches: RayMatches, state: TwoViewState, threshold: float) -> Flags:
     """Matches within `threshold` [px] whose depths are plausible."""
     return within(residuals(matches.observations, state), matches, state, threshold)
-
-
-# -- Noise of the matches, from their residuals: a mixture of two variances -----------------------
-
-# Matches of more noise than the rest: how many times as much, and their initial share.
-WORSE = 3.0
-FIRST_SHARE = 0.1
-# Number of matches as which the configured noise counts, and the prior that all are good.
-PRIOR_MATCHES = 10.0
-LIKELY_GOOD = 20.0
-# Iterations of expectation maximisation.
-EM_ROUNDS = 6
-# Degrees of freedom that the residuals usually lose to the fit: pose and observable velocities.
-FITTED = 11
-# Of a squared residual in variances: beyond it the exponential would overflow.
-LARGEST = 700.0
-
-
-@kernel
-def noise_mixture(r: Array, use: Flags, configured: float) -> tuple[Array, float]:
-    """Weights (N,) of the matches in `use` and the noise [px] of good ones, by their residuals.
-
-    Some tracks are worse than others: a share h has `WORSE` times the noise of the rest. Both are
-    found by expectation maximisation; the weight of a match is the mean of its inverse variance.
-    The configured sigma counts as ten matches.
-    """
-    weights = np.zeros(len(r))
-    count, squares = 0, 0.0
-    for i in range(len(r)):
-        if use[i]:
-            count += 1
-            squares += r[i] * r[i]
-            weights[i] = 1.0
-    freedom = PRIOR_MATCHES + max(count - FITTED, 0)
-    variance = (PRIOR_MATCHES * configured * configured + squares) / freedom
-    share = FIRST_SHARE
-    for _ in range(EM_ROUNDS):
-        squares, worse = 0.0, 0.0
-        for i in range(len(r)):
-            if use[i]:
-                r2 = r[i] * r[i] / variance
-                if not r2 < LARGEST:
-                    r2 = LARGEST
-                ratio = (
-                    share
-                    / (1.0 - share)
-                    / WORSE
-                    * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE)))
-                )
-                p = ratio / (1.0 + ratio)
-                worse += p
-                weights[i] = 1.0 - p * (1.0 - 1.0 / (WORSE * WORSE))
-                squares += weights[i] * r[i] * r[i]
-        variance = (PRIOR_MATCHES * configured * configured + squares) / freedom
-        share = (worse + 1.0) / (count + LIKELY_GOOD)
-    return weights, math.sqrt(variance)

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_relpose_ros.config.settings import CarrierMotion, MOTIONS
+from rs_relpose_ros.core.losses import Flags, noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.covariance import ImageInformation, ROTATION, sandwich, scaled_like
 from rs_relpose_ros.estimator.fit import DataTerm, fit, FitMatches, linearised
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
-from rs_relpose_ros.estimator.sampson import Flags, RayMatches
+from rs_relpose_ros.estimator.sampson import RayMatches
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.jit import kernel, small_kernel
@@ -127,7 +128,7 @@ def _selected(
     """Inliers of a state, with their noise."""
     r = sampson.residuals(matches.observations, state)
     inliers = sampson.within(r, matches, state, threshold)
-    weights, sigma = sampson.noise_mixture(r, inliers, prior_sigma)
+    weights, sigma = noise_mixture(r, inliers, prior_sigma)
     return FitMatches(matches.observations, weights, sigma)
 
 

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.core.losses import robust_scale
+from rs_relpose_ros.core.triangulate import depths_of_rays
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation, POSE, ROTATION
-from rs_relpose_ros.estimator.result import depths_of_rays, Status
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
@@ -392,9 +394,9 @@ class PoseChain:
             return self._scale, 0, math.nan
         median = float(np.median(ratios))
         self._scale *= median
-        # Median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
-        scatter = float(np.median(np.abs(ratios - median))) / median
-        return self._scale, len(ratios), 1.2533 * 1.4826 * scatter / len(ratios) ** 0.5
+        # The sigma of the median of n normal deviates is sqrt(pi / 2) sigma / sqrt(n).
+        scatter = robust_scale(ratios - median, 0.0, 0.0) / median
+        return self._scale, len(ratios), 1.2533 * scatter / math.sqrt(len(ratios))
 
     def _end(self, reason: str, *, new_axes: bool = False) -> None:
         """End the path, with its axes if these are `new`; the first reason is the next path's."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator import priors
 from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
@@ -128,8 +129,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     )
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
-    sigma = _noise(r)
-    weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
+    sigma = robust_scale(r, _LEAST_SIGMA, 0.0)
+    weights = cauchy_weight((r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
     delays = np.zeros((FOCAL, *shares.shape))
     delays[READOUT] = _STEP * shares
@@ -231,10 +232,6 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
     return by_regions, min(ratio(without), by_regions)
 
 
-def _noise(r: Array) -> float:
-    return max(1.4826 * so3.median(np.abs(r)), _LEAST_SIGMA)
-
-
 def _state(
     pair: PairData, problem: TwoViewProblem, observations: Array, prior: priors.Priors, fit: bool
 ) -> TwoViewState:
@@ -251,7 +248,9 @@ def _state(
     if not fit:
         return state
     r = np.abs(residuals(observations, state))
-    matches = FitMatches(observations, (r < 4.0 * np.median(r)).astype(float), _noise(r))
+    matches = FitMatches(
+        observations, (r < 4.0 * np.median(r)).astype(float), robust_scale(r, _LEAST_SIGMA, 0.0)
+    )
     return gauss_newton(matches, state, prior, _NEW_STEPS)
 
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
@@ -44,7 +45,7 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
     first, second = rays1[finite], rays2[finite]
     rotation = aligning_rotation(first.T @ second)
     squares = ((first - second @ rotation.T) ** 2).sum(axis=1)
-    weights = 1.0 / (1.0 + squares / max(float(np.median(squares)), 1e-12))
+    weights = cauchy_weight(squares / max(float(np.median(squares)), 1e-12))
     return log_so3(aligning_rotation((first.T * weights) @ second))
 
 

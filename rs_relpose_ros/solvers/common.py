@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
     copy_matrix,
@@ -125,13 +126,10 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
             x[1] + (tau2 * x[7] - tau1 * x[4]),
             x[2] + (tau2 * x[8] - tau1 * x[5]),
         )
-        along1, along2, cosine = dot(f1, b), dot(h, b), dot(f1, h)
-        # Both depths times sin^2 of the angle between the rays.
-        depth1 = along1 - cosine * along2
-        depth2 = cosine * along1 - along2
-        if depth1 > 0.0 and depth2 > 0.0:
+        along1, along2, _ = scaled_depths(f1, h, b)
+        if along1 > 0.0 and along2 > 0.0:
             front += 1
-        elif depth1 < 0.0 and depth2 < 0.0:
+        elif along1 < 0.0 and along2 < 0.0:
             behind += 1
     return front, behind
 
