@@ -23,6 +23,7 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu import integration
 from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample
 from rs_relpose_ros.imu.filters import BIAS_MEMORY, BiasTracker
+from rs_relpose_ros.imu.integration import ImuSlice
 from rs_relpose_ros.messages.incoming import imu_sample_from_message
 
 PERIOD = 5_000_000
@@ -177,15 +178,14 @@ def test_borders_are_interpolated_between_the_neighbouring_samples(first, last):
 
 def test_covariance_equals_the_spread_of_noisy_integrations():
     rng = np.random.default_rng(2)
-    config = ImuConfig(gyro_noise_density=2e-3)
     stamps, rates = at_200_hz(81), 3.0 * wobble(81)
     integrate = integration.integrate_rotation
-    expected, covariance = integrate(stamps, rates, config, 5e-3)
+    expected, covariance = integrate(stamps, rates, 2e-3, 5e-3)
     errors = []
     for _ in range(3000):
         # White noise of density n sampled at f has n sqrt(f) per sample.
         noise = rng.normal(size=rates.shape) * 2e-3 * np.sqrt(200.0)
-        noisy, _ = integrate(stamps, rates + noise + rng.normal(size=3) * 5e-3, config, 5e-3)
+        noisy, _ = integrate(stamps, rates + noise + rng.normal(size=3) * 5e-3, 2e-3, 5e-3)
         errors.append(Rotation.from_matrix(expected @ noisy.T).as_rotvec())
     sigma = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
@@ -210,9 +210,7 @@ def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows(
         ):
             expected = expected * step
         angles += np.linalg.norm(rates[k]) * dt
-        rotation, _ = integration.integrate_rotation(
-            stamps[: k + 2], rates[: k + 2], ImuConfig(), 0.0
-        )
+        rotation, _ = integration.integrate_rotation(stamps[: k + 2], rates[: k + 2], 0.0, 0.0)
         np.testing.assert_allclose(motion.knot_rotations[k + 1], rotation, atol=1e-12)
     # Fourth order; without the term w_0 x w_1 it is 4e-4.
     assert (Rotation.from_matrix(rotation).inv() * expected).magnitude() < 1e-6 * angles
@@ -892,17 +890,8 @@ def motion_of_frames(walk, change=lambda time, force: force, own_topic=False):
         frame_imu(buffer, (stamp, stamp + READOUT_NS), stamp, R_CAM_IMU, previous)
         for stamp, previous in zip(stamps, [None, *stamps], strict=False)
     )
-    for frame in later:
-        if isinstance(frame.force, str):
-            return frame.force
-    gyro, forces = (
-        reduce(lambda a, b: a.joined(b), segments)
-        for segments in (
-            [frame.since_previous for frame in later],
-            [f.force.since_previous for f in later],
-        )
-    )
-    return integration.inertial_motion(gyro, forces, first, later[-1], config)
+    since = reduce(ImuSlice.joined, [frame.since_previous for frame in later])
+    return integration.inertial_motion(since, first, later[-1], config)
 
 
 @pytest.mark.parametrize('own_topic', [False, True])

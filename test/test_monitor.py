@@ -39,6 +39,7 @@ SCALE, FOCAL, DISTORTION = findings.SCALE, findings.FOCAL, findings.DISTORTION
 DEVIATIONS = findings.DEVIATIONS
 MS = 1_000_000
 NONE = np.zeros(DEVIATIONS)
+GYRO_NOISE = ImuConfig().gyro_noise_density
 R_CAM_IMU = Rotation.from_euler('xyz', [90, 0, 30], degrees=True)
 CAMERA = RollingShutterCamera(
     width=640,
@@ -123,7 +124,7 @@ def pair_data(start, end, c, camera=CAMERA):
         stamps_ns, rates = gyro(stamp + earliest - 1e-3, stamp + latest + 1e-3, c)
         motions.append(FrameMotion.from_gyro(1e-9 * stamps_ns - stamp, rates))
     stamps_ns, rates = gyro(start, end, c)
-    rotation, covariance = integrate_rotation(stamps_ns, rates, ImuConfig(), 3e-3)
+    rotation, covariance = integrate_rotation(stamps_ns, rates, GYRO_NOISE, 3e-3)
     first, second = (ORIENTATION(stamp + c[OFFSET]) for stamp in (start, end))
     t = first.inv().apply(VELOCITY)
     return PairData(
@@ -136,8 +137,8 @@ def pair_data(start, end, c, camera=CAMERA):
         t / np.linalg.norm(t),
         rotation,
         covariance,
-        rotation_sensitivity(stamps_ns, rates, ImuConfig()),
-        integration.GyroSegment(stamps_ns, rates, np.zeros(3), 3e-3),
+        rotation_sensitivity(stamps_ns, rates, GYRO_NOISE),
+        integration.ImuSlice(stamps_ns, rates, np.zeros(3), 3e-3, GYRO_NOISE),
         R_CAM_IMU.as_matrix(),
         0.01,
     )
@@ -281,11 +282,11 @@ def test_derivative_by_the_rates_by_finite_differences():
     stamps = np.arange(0, 500 * MS, 5 * MS)
     t = stamps[:, None] * 1e-9
     rates = np.array([1.5, 1.8, 1.2]) * np.sin(t * [3.1, 2.3, 4.7] + [0.3, 1.1, 2.0])
-    by_rate = rotation_sensitivity(stamps, rates, ImuConfig()).by_rate
+    by_rate = rotation_sensitivity(stamps, rates, GYRO_NOISE).by_rate
     for axis in range(3):
         step = 1e-5 * np.eye(3)[axis]
-        more, _ = integrate_rotation(stamps, rates + step, ImuConfig(), 0.0)
-        less, _ = integrate_rotation(stamps, rates - step, ImuConfig(), 0.0)
+        more, _ = integrate_rotation(stamps, rates + step, GYRO_NOISE, 0.0)
+        less, _ = integrate_rotation(stamps, rates - step, GYRO_NOISE, 0.0)
         np.testing.assert_allclose(
             Rotation.from_matrix(more @ less.T).as_rotvec() / 2e-5, by_rate[:, axis], atol=1e-5
         )

@@ -444,7 +444,7 @@ def test_a_shifted_frame_waits_for_its_shifted_rows(offline):
     add_frames(sequencer, 150)
     frames = [first, *drain(sequencer)]
     assert since_start(*(frame.imu.reference_ns for frame in frames)) == [50, 120, 170]
-    assert [frame.imu.applied_offset_ns for frame in frames] == [0, 20 * MS, 20 * MS]
+    assert [frame.applied_offset_ns for frame in frames] == [0, 20 * MS, 20 * MS]
     assert [since_start(*frame.imu.since_previous.stamps_ns[[0, -1]]) for frame in frames[1:]] == [
         [50, 120],
         [120, 170],

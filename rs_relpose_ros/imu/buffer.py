@@ -20,7 +20,7 @@ from rs_relpose_ros.geometry.so3 import integrated_rotations, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
-from rs_relpose_ros.imu.integration import ForceSegment, FrameForce, FrameImu, GyroSegment
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 
 Stamps = NDArray[np.int64]
 Vector = tuple[float, float, float]
@@ -313,7 +313,7 @@ class ImuBuffer(ImuSamples):
     """
 
     def __init__(self, config: ImuConfig) -> None:
-        self._config = config
+        self.config = config
         self._configured_bias = np.array(config.gyro_bias)
         self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
         super().__init__(config.max_imu_gap)
@@ -321,8 +321,8 @@ class ImuBuffer(ImuSamples):
     def clear(self) -> None:
         """Remove all samples and reset the filters."""
         super().clear()
-        self._filter = filters.GravityFilter(self._config)
-        self._bias = filters.BiasTracker(self._config)
+        self._filter = filters.GravityFilter(self.config)
+        self._bias = filters.BiasTracker(self.config)
         self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
 
     def add(self, sample: ImuSample) -> bool:
@@ -362,6 +362,11 @@ class ImuBuffer(ImuSamples):
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
+    def covers(self, start_ns: int, end_ns: int, exposure: float) -> bool:
+        """Whether the gyro covers the exposures [s] of all rows between two times."""
+        half = to_nanoseconds(0.5 * exposure)
+        return self.gyro.coverage(start_ns - half, end_ns + half) is Coverage.AVAILABLE
+
     def recent_forces(self, until_ns: int, duration_ns: int | None = None) -> Array:
         """Specific forces (K, 3) [m/s^2] up to a time, IMU frame."""
         stamps = self.force.stamps
@@ -382,7 +387,7 @@ class ImuBuffer(ImuSamples):
         """``R_start^T R_end`` (3, 3) in the IMU frame, covariance: see `integrate_rotation`."""
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
         return integration.integrate_rotation(
-            stamps_ns, rates, self._config, self.bias(end_ns).sigma
+            stamps_ns, rates, self.config.gyro_noise_density, self.bias(end_ns).sigma
         )
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
@@ -391,7 +396,7 @@ class ImuBuffer(ImuSamples):
         To be called in the order of time: before that of an earlier call, its estimate is
         rotated back.
         """
-        if self._config.gravity_filter == 'mean':
+        if self.config.gravity_filter == 'mean':
             estimate = filters.mean_gravity(self.recent_forces(at_ns, filters.MEAN_WINDOW_NS))
         else:
             self._run_filters(at_ns)
@@ -399,7 +404,7 @@ class ImuBuffer(ImuSamples):
             if estimate is not None and stamp_ns is not None:
                 estimate = self._propagated(estimate, stamp_ns, at_ns)
         last = int(np.searchsorted(self._down.stamps, at_ns, side='right')) - 1
-        if last >= 0 and self._config.use_imu_orientation:
+        if last >= 0 and self.config.use_imu_orientation:
             own_ns, (*down, sigma) = int(self._down.stamps[last]), self._down.values[last].tolist()
             if (
                 at_ns - own_ns <= self._gap_ns
@@ -437,7 +442,7 @@ class ImuBuffer(ImuSamples):
                 forces[fresh] = self.force.values[k[fresh]]
             self._bias.run(stamps, rates, forces)
             # With the configured bias only: the gravity filter estimates the rest.
-            if self._config.gravity_filter == 'complementary':
+            if self.config.gravity_filter == 'complementary':
                 self._filter.run(stamps, rates - self._configured_bias, forces)
             self._filtered_ns = int(stamps[-1])
 
@@ -454,76 +459,85 @@ def frame_imu(
 ) -> FrameImu:
     """The IMU's share of a frame; all times are on the IMU clock, ``v_cam = R_cam_imu v_imu``.
 
-    `span_ns`: from the first row's exposure to the end of the last one's; `reference_ns`,
-    `previous_reference_ns`: of the stamped rows of this frame and the one before; `exposure`
-    [s]: of a row; `gyro_only`: without gravity and specific force.
+    `span_ns`: from the begin of the first row's exposure to the end of the last one's.
+    `reference_ns`, `previous_reference_ns`: times of the stamped rows of this frame and of the
+    one before. `exposure`: of a row [s]. `gyro_only`: without gravity and specific force.
     """
     half = to_nanoseconds(0.5 * exposure)
-    start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half  # of the rows' times
-    stamps_ns, rates = buffer.angular_velocity(start_ns, end_ns, exposure)
-    rates = rates @ R_cam_imu.T
-    if end_ns > start_ns:
-        motion = FrameMotion.from_gyro((stamps_ns - reference_ns) * 1e-9, rates)
-    else:
-        motion = FrameMotion(rates[0])
-    gravity_sigma = None
-    # Causal up to the last row, then propagated back to the stamped row.
-    estimate = None if gyro_only else buffer.gravity(end_ns)
-    if estimate is not None:
-        R = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
-        motion = validate.replaced(motion, gravity=R @ (R_cam_imu @ estimate.direction))
-        gravity_sigma = estimate.sigma
+    span_ns = span_ns[0] + half, span_ns[1] - half  # of the middle of the rows' exposures
+    motion = _rows_motion(buffer, span_ns, reference_ns, R_cam_imu, exposure)
+    # The filter runs up to the last row; its direction is rotated back to the stamped row.
+    gravity = None if gyro_only else buffer.gravity(span_ns[1])
+    if gravity is not None:
+        back = motion.rotations([(span_ns[1] - reference_ns) * 1e-9])[0]
+        motion = validate.replaced(motion, gravity=back @ (R_cam_imu @ gravity.direction))
+    start_ns = reference_ns if previous_reference_ns is None else previous_reference_ns
+    before = buffer.force.between(min(start_ns, reference_ns), reference_ns)
+    readout = buffer.force.between(*span_ns)
+    no_force = 'not needed' if gyro_only else force_fault(buffer.recent_forces(span_ns[1]))
+    if not no_force and (before is None or readout is None or gravity is None):
+        no_force = 'the accelerometer has a gap'
     since_previous = None
-    if (
-        previous_reference_ns is not None
-        and previous_reference_ns < reference_ns
-        and buffer.gyro.coverage(previous_reference_ns - half, reference_ns + half)
-        is Coverage.AVAILABLE
-    ):
-        stamps_ns, rates = buffer.angular_velocity(previous_reference_ns, reference_ns, exposure)
-        bias = buffer.bias(reference_ns)
-        since_previous = GyroSegment(
-            stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value, bias.sigma
-        )
-    return FrameImu(
-        motion,
-        gravity_sigma,
-        reference_ns,
-        since_previous,
-        exposure=exposure,
-        force='not needed'
-        if gyro_only
-        else _frame_force(
-            buffer, span_ns, reference_ns, R_cam_imu, motion, previous_reference_ns, estimate
-        ),
-    )
+    if start_ns < reference_ns and buffer.covers(start_ns, reference_ns, exposure):
+        since_previous = _slice(buffer, (start_ns, reference_ns), R_cam_imu, exposure, no_force)
+        if not no_force and before is not None:
+            since_previous = replace(
+                since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
+            )
+    sigma = None if gravity is None else gravity.sigma
+    imu = FrameImu(motion, sigma, reference_ns, since_previous, no_force)
+    if no_force or readout is None or gravity is None:
+        return imu
+    force = _mean_force(motion, readout[0] - reference_ns, readout[1] @ R_cam_imu.T)
+    return replace(imu, force=force, at_rest=gravity.length, at_rest_sigma=gravity.length_sigma)
 
 
-def _frame_force(
+def _rows_motion(
     buffer: ImuBuffer,
     span_ns: tuple[int, int],
     reference_ns: int,
     R_cam_imu: Array,
-    motion: FrameMotion,
-    previous_reference_ns: int | None,
-    gravity: GravityEstimate | None,
-) -> FrameForce | str:
-    """The accelerometer's share of a frame, or the reason why there is none."""
-    if fault := force_fault(buffer.recent_forces(span_ns[1])):
-        return fault
-    first_ns = span_ns[0] if previous_reference_ns is None else previous_reference_ns
-    within = buffer.force.between(*span_ns)
-    before = buffer.force.between(min(first_ns, reference_ns), reference_ns)
-    if within is None or before is None or gravity is None:
-        return 'the accelerometer has a gap'
-    stamps_ns, forces = within
-    seconds = (stamps_ns - reference_ns) * 1e-9
-    forces = np.einsum('kij,kj->ki', motion.rotations(seconds), forces @ R_cam_imu.T)
-    steps = np.diff(seconds, append=seconds[-1]) + np.diff(seconds, prepend=seconds[0])
-    mean = forces[0] if len(forces) == 1 else steps @ forces / steps.sum()
-    return FrameForce(
-        mean,
-        gravity.length,
-        gravity.length_sigma,
-        ForceSegment(before[0], before[1] @ R_cam_imu.T),
+    exposure: float,
+) -> FrameMotion:
+    """Rotation of the camera during the readout of a frame."""
+    stamps_ns, rates = buffer.angular_velocity(*span_ns, exposure)
+    rates = rates @ R_cam_imu.T
+    if span_ns[0] == span_ns[1]:  # a global shutter
+        return FrameMotion(rates[0])
+    return FrameMotion.from_gyro((stamps_ns - reference_ns) * 1e-9, rates)
+
+
+def _slice(
+    buffer: ImuBuffer,
+    between_ns: tuple[int, int],
+    R_cam_imu: Array,
+    exposure: float,
+    no_force: str,
+) -> ImuSlice:
+    """The gyro between two stamped rows."""
+    stamps_ns, rates = buffer.angular_velocity(*between_ns, exposure)
+    bias = buffer.bias(between_ns[1])
+    return ImuSlice(
+        stamps_ns,
+        rates @ R_cam_imu.T,
+        R_cam_imu @ bias.value,
+        bias.sigma,
+        buffer.config.gyro_noise_density,
+        no_force,
     )
+
+
+def _mean_force(motion: FrameMotion, times_ns: Stamps, forces: Array) -> Array:
+    """Mean (3,) of specific forces (K, 3), in the axes of the stamped row.
+
+    `times_ns` (K,): of the forces, from the stamped row on. Forces are linear between samples:
+    each one counts for half of the steps beside it.
+    """
+    row_times = times_ns * 1e-9
+    forces = np.einsum('kij,kj->ki', motion.rotations(row_times), forces)
+    if len(forces) == 1:
+        return np.asarray(forces[0])
+    after = np.diff(row_times, append=row_times[-1])
+    before = np.diff(row_times, prepend=row_times[0])
+    weights = after + before
+    return np.asarray(weights @ forces / weights.sum())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,93 +17,110 @@ from rs_relpose_ros.geometry.so3 import integrated_rotations, skew
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.jit import kernel
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ForceSegment:
-    """Specific force between two times, borders interpolated, camera frame."""
-
-    stamps_ns: NDArray[np.int64]  # (K,) the first and the last are the two times
-    forces: Array  # (K, 3) [m/s^2]
-
-    def joined(self, later: ForceSegment) -> ForceSegment:
-        """This segment and the one that starts where it ends."""
-        return ForceSegment(
-            np.concatenate([self.stamps_ns, later.stamps_ns[1:]]),
-            np.concatenate([self.forces, later.forces[1:]]),
-        )
+Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameForce:
-    """Specific force about a frame, in the axes of its stamped row."""
+@dataclass(frozen=True, eq=False)
+class ImuSlice:
+    """Samples of the IMU between the stamped rows of two frames, in the camera frame.
 
-    within: Array  # (3,) mean over the readout [m/s^2]
-    at_rest: float  # length of the specific force at rest, as measured by this sensor [m/s^2]
-    at_rest_sigma: float
-    since_previous: ForceSegment  # since the previous frame's stamped row, if there is one
+    The first and the last sample of each sensor are interpolated at the two rows. Without
+    specific force `forces` is empty, and `no_force` is the reason.
+    """
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroSegment:
-    """Gyro samples between two times, borders interpolated, bias removed, camera frame."""
-
-    stamps_ns: NDArray[np.int64]  # (K,) the first and the last are the two times
-    angular_velocities: Array  # (K, 3) [rad/s]
+    stamps_ns: Stamps  # (K,) of the gyro
+    angular_velocities: Array  # (K, 3) [rad/s], bias removed
     bias: Array  # (3,) [rad/s] that was removed; the mean if it changed meanwhile
     bias_sigma: float  # [rad/s] per axis
+    noise_density: float  # [rad/s/sqrt(Hz)] of the gyro
+    no_force: str = 'there is no accelerometer'
+    force_stamps_ns: Stamps = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (M,)
+    forces: Array = field(default_factory=lambda: np.empty((0, 3)))  # (M, 3) [m/s^2]
 
     @property
     def duration(self) -> float:
         """Seconds from the first to the last sample."""
         return seconds_between(int(self.stamps_ns[0]), int(self.stamps_ns[-1]))
 
-    def joined(self, later: GyroSegment) -> GyroSegment:
-        """This segment and the one that starts where it ends."""
+    @property
+    def rotation(self) -> Array:
+        """``R_start^T R_end`` (3, 3) as integrated from the gyro."""
+        return self._integrated[0]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (3, 3) [rad^2] of the error of `rotation`; see `integrate_rotation`."""
+        return self._integrated[1]
+
+    @cached_property
+    def _integrated(self) -> tuple[Array, Array]:
+        return integrate_rotation(
+            self.stamps_ns, self.angular_velocities, self.noise_density, self.bias_sigma
+        )
+
+    def joined(self, later: ImuSlice) -> ImuSlice:
+        """This slice and the one that starts where it ends."""
         share = later.duration / (self.duration + later.duration)
-        return GyroSegment(
+        return ImuSlice(
             np.concatenate([self.stamps_ns, later.stamps_ns[1:]]),
             np.concatenate([self.angular_velocities, later.angular_velocities[1:]]),
             self.bias + share * (later.bias - self.bias),
             max(self.bias_sigma, later.bias_sigma),
+            later.noise_density,
+            later.no_force or self.no_force,
+            np.concatenate([self.force_stamps_ns, later.force_stamps_ns[1:]]),
+            np.concatenate([self.forces, later.forces[1:]]),
+        )
+
+    def at_common_times(self) -> tuple[Array, Array, Array]:
+        """Times (K,) [s], rates (K, 3) and forces (K, 3) at the stamps of both sensors."""
+        start_ns = min(self.stamps_ns[0], self.force_stamps_ns[0])
+        return at_common_times(
+            (self.stamps_ns - start_ns) * 1e-9,
+            self.angular_velocities,
+            (self.force_stamps_ns - start_ns) * 1e-9,
+            self.forces,
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameImu:
-    """The IMU's share of a frame, all in the camera frame."""
+    """The IMU's share of a frame, all in the camera frame.
+
+    Without specific force `force`, `at_rest` and its sigma are NaN, and `no_force` is the reason.
+    """
 
     motion: FrameMotion  # relative to the stamped row
     gravity_sigma: float | None  # [rad] per axis of the direction; None without one
     reference_ns: int  # time of the stamped row on the IMU clock
     # Since the previous frame's stamped row; None for the first frame or after a gap.
-    since_previous: GyroSegment | None
-    applied_offset_ns: int = 0  # tracked time offset in these times, beyond the parameter's
-    exposure: float = 0.0  # of a row [s], over which the gyro is averaged
-    ahead: float = 0.0  # [s] newest stamp of the gyro when the image came, less `reference_ns`
-    force: FrameForce | str = 'there is no accelerometer'  # or the reason why there is none
+    since_previous: ImuSlice | None
+    no_force: str = 'there is no accelerometer'
+    force: Array = field(default_factory=lambda: np.full(3, np.nan))  # mean of the readout [m/s^2]
+    at_rest: float = np.nan  # [m/s^2] length of the specific force at rest, as this sensor reads
+    at_rest_sigma: float = np.nan
 
 
-def mean_rates(
-    stamps_ns: NDArray[np.int64], rates: Array, at_ns: NDArray[np.int64], width: float | Array
-) -> Array:
+def mean_rates(stamps_ns: Stamps, rates: Array, at_ns: Stamps, width: float | Array) -> Array:
     """Exact means (N, 3) of rates (K, 3), linear between samples, over `width` [s] about `at_ns`.
 
-    Beyond the samples, the mean is that of the part which they cover.
+    Beyond the samples, the mean is taken over the part of the interval which they cover.
     """
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     steps = np.diff(seconds)
-    integral = np.vstack(
-        [np.zeros(3), np.cumsum(0.5 * (rates[1:] + rates[:-1]) * steps[:, None], axis=0)]
-    )
+    areas = 0.5 * (rates[1:] + rates[:-1]) * steps[:, None]
+    integral = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
     slopes = np.diff(rates, axis=0) / steps[:, None]
 
     def integral_at(times: Array) -> Array:
-        k = np.clip(np.searchsorted(seconds, times, side='right') - 1, 0, len(steps) - 1)
+        k = np.searchsorted(seconds, times, side='right') - 1
+        k = np.clip(k, 0, len(steps) - 1)
         since = (times - seconds[k])[:, None]
         return np.asarray(integral[k] + since * (rates[k] + 0.5 * since * slopes[k]))
 
     middle = (at_ns - stamps_ns[0]) * 1e-9
-    begin, end = (np.clip(middle + side, 0.0, seconds[-1]) for side in (-0.5 * width, 0.5 * width))
+    begin = np.clip(middle - 0.5 * width, 0.0, seconds[-1])
+    end = np.clip(middle + 0.5 * width, 0.0, seconds[-1])
     return np.asarray((integral_at(end) - integral_at(begin)) / (end - begin)[:, None])
 
 
@@ -116,7 +134,9 @@ def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
         derivative = sum L_k dt        noise = sum L_k L_k^T dt
     """
     rotations = integrated_rotations(seconds, rates)
-    derivative, noise, L = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    derivative = np.zeros((3, 3))
+    noise = np.zeros((3, 3))
+    L = np.empty((3, 3))
     for k in range(len(seconds) - 1):
         dt = seconds[k + 1] - seconds[k]
         turn = so3.step_rotation(rates[k], rates[k + 1], dt)
@@ -129,18 +149,17 @@ def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
 
 
 def integrate_rotation(
-    stamps_ns: NDArray[np.int64], rates: Array, config: ImuConfig, bias_sigma: float
+    stamps_ns: Stamps, rates: Array, noise_density: float, bias_sigma: float
 ) -> tuple[Array, Array]:
     """Rotation ``R_start^T R_end`` (3, 3) between the first and the last sample, its covariance.
 
     The covariance (3, 3) [rad^2] is that of dtheta in the start frame, ``R_true = Exp(dtheta) R``.
-    The stamps (K,) strictly increase; the rates (K, 3) [rad/s], their bias removed up to
-    `bias_sigma` per axis, are linear between samples.
+    The stamps (K,) strictly increase; the rates (K, 3) [rad/s], with white noise of
+    `noise_density` and their bias removed up to `bias_sigma` per axis, are linear between samples.
     """
-    rotation, derivative, noise = _integrate(
-        (stamps_ns - stamps_ns[0]) * 1e-9, np.ascontiguousarray(rates)
-    )
-    covariance = config.gyro_noise_density**2 * noise + bias_sigma**2 * derivative @ derivative.T
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    rotation, derivative, noise = _integrate(seconds, np.ascontiguousarray(rates))
+    covariance = noise_density**2 * noise + bias_sigma**2 * derivative @ derivative.T
     return rotation, covariance
 
 
@@ -154,15 +173,20 @@ class RotationSensitivity:
 
 
 def rotation_sensitivity(
-    stamps_ns: NDArray[np.int64], rates: Array, config: ImuConfig
+    stamps_ns: Stamps, rates: Array, noise_density: float
 ) -> RotationSensitivity:
-    """Of ``R_start^T R_end``; arguments as in `integrate_rotation`."""
-    seconds, step = (stamps_ns - stamps_ns[0]) * 1e-9, 1e-4
+    """Sensitivity of ``R_start^T R_end``; arguments as in `integrate_rotation`."""
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     rotation, by_rate, noise = _integrate(seconds, np.ascontiguousarray(rates))
-    scaled, _, _ = _integrate(seconds, (1.0 + step) * rates)
-    return RotationSensitivity(
-        config.gyro_noise_density**2 * noise, by_rate, so3.log_so3(scaled @ rotation.T) / step
-    )
+    scaled, _, _ = _integrate(seconds, (1.0 + _SCALE_STEP) * rates)
+    by_scale = so3.log_so3(scaled @ rotation.T) / _SCALE_STEP
+    return RotationSensitivity(noise_density**2 * noise, by_rate, by_scale)
+
+
+# Relative change of the rates by which their scale is differentiated. The rotation is smooth in
+# it: the error of the derivative is this share of it, and rounding adds 1e-12 of a rotation.
+# [chosen: any value in 1e-6..1e-3 would do]
+_SCALE_STEP = 1e-4
 
 
 # -- Preintegrated acceleration of the IMU, with its covariance -----------------------------------
@@ -179,13 +203,11 @@ def at_common_times(
     times1: Array, values1: Array, times2: Array, values2: Array
 ) -> tuple[Array, Array, Array]:
     """Times (K,) of two series, and the values (K, 3) of both, linearly interpolated."""
-    if np.array_equal(times1, times2):  # one topic
+    if np.array_equal(times1, times2):  # both sensors are in the same messages
         return times1, values1, values2
     times = np.union1d(times1, times2)
-    resampled1, resampled2 = (
-        np.column_stack([np.interp(times, of_series, axis) for axis in values.T])
-        for of_series, values in ((times1, values1), (times2, values2))
-    )
+    resampled1 = np.column_stack([np.interp(times, times1, axis) for axis in values1.T])
+    resampled2 = np.column_stack([np.interp(times, times2, axis) for axis in values2.T])
     return times, resampled1, resampled2
 
 
@@ -206,43 +228,52 @@ def preintegrate(
     of free fall, in the axes of the first sample. `lever_arm` (3,) [m]: position of the IMU in the
     frame of these vectors. `bias_sigma` [rad/s]: of the gyro's bias, per axis.
     """
-    steps, duration = np.diff(seconds), float(seconds[-1] - seconds[0])
+    steps = np.diff(seconds)
+    duration = float(seconds[-1] - seconds[0])
     rotations = integrated_rotations(seconds, rates)
     once, twice = force_integrals(steps, np.einsum('kij,kj->ki', rotations, forces))
     beta = once[-1] + duration * gravity
     alpha = twice[-1] + 0.5 * duration**2 * gravity
 
-    by_constant = np.vstack([0.5 * duration**2 * np.eye(3), duration * np.eye(3)])
+    by_gravity = np.vstack([0.5 * duration**2 * np.eye(3), duration * np.eye(3)])
     by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
-    of_noise = so3.by_axes(
-        np.array([[duration**3 / 3.0, duration**2 / 2.0], [duration**2 / 2.0, duration]])
-    )
-    # b t = (v_1 + w_1 x p) T + alpha + p - R p,   R (v_2 + w_2 x p) = v_1 + w_1 x p + beta
-    R = rotations[-1]
-    by_arm = np.vstack(
-        [duration * skew(rates[0]) + np.eye(3) - R, skew(rates[0]) - R @ skew(rates[-1])]
-    )
+    crossed = duration**2 / 2.0
+    of_noise = so3.by_axes(np.array([[duration**3 / 3.0, crossed], [crossed, duration]]))
+    by_arm = _by_lever_arm(duration, rotations[-1], rates)
+    squared_steps = np.einsum('k,kij,klj->il', 1.0 / steps, by_rates, by_rates)
     covariance = (
         config.accel_noise_density**2 * of_noise
         + config.accel_bias_sigma**2 * by_bias @ by_bias.T
-        + by_constant @ gravity_covariance @ by_constant.T
-        + config.gyro_noise_density**2
-        * np.einsum('k,kij,klj->il', 1.0 / steps, by_rates, by_rates)
+        + by_gravity @ gravity_covariance @ by_gravity.T
+        + config.gyro_noise_density**2 * squared_steps
         + bias_sigma**2 * by_gyro @ by_gyro.T
         + config.imu_position_sigma**2 * by_arm @ by_arm.T
     )
     return InertialMotion(alpha, beta, duration, covariance, lever_arm)
 
 
+def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
+    """Derivatives (6, 3) of the camera's (alpha, beta) by the lever arm p.
+
+    With the pose (R, b t) of the second frame in the first one::
+
+        b t = (v_1 + w_1 x p) T + alpha + p - R p
+        R (v_2 + w_2 x p) = v_1 + w_1 x p + beta
+    """
+    swing1 = skew(rates[0])
+    swing2 = R @ skew(rates[-1])
+    return np.vstack([duration * swing1 + np.eye(3) - R, swing1 - swing2])
+
+
 def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
     """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
-    mean = 0.5 * (forces[1:] + forces[:-1]) * steps[:, None]
-    once = np.vstack([np.zeros(3), np.cumsum(mean, axis=0)])
-    moved = (
-        once[:-1] * steps[:, None] + (2.0 * forces[:-1] + forces[1:]) * (steps**2 / 6.0)[:, None]
-    )
+    before, after = forces[:-1], forces[1:]
+    gained = 0.5 * (after + before) * steps[:, None]
+    once = np.vstack([np.zeros(3), np.cumsum(gained, axis=0)])
+    curved = (2.0 * before + after) * (steps**2 / 6.0)[:, None]
+    moved = once[:-1] * steps[:, None] + curved
     return once, np.vstack([np.zeros(3), np.cumsum(moved, axis=0)])
 
 
@@ -257,101 +288,79 @@ def _error_derivatives(
     steps = np.diff(seconds)
     middle = seconds[:-1] + 0.5 * steps
     left = seconds[-1] - middle
-    halfway = (
-        rotations[:-1]
-        @ Rotation.from_rotvec(0.25 * steps[:, None] * (rates[1:] + rates[:-1])).as_matrix()
-    )
+    half_turns = 0.25 * steps[:, None] * (rates[1:] + rates[:-1])
+    halfway = rotations[:-1] @ Rotation.from_rotvec(half_turns).as_matrix()
     # A bias rotates with the IMU.
     by_bias = np.vstack(
         [np.einsum('k,kij->ij', left * steps, halfway), np.einsum('k,kij->ij', steps, halfway)]
     )
     # A rotation theta in step k rotates all later forces: by -[F]x theta, F being their integral.
-    later = once[-1] - 0.5 * (once[1:] + once[:-1])
-    later_way = (
-        twice[-1] - 0.5 * (twice[1:] + twice[:-1]) - 0.5 * (once[1:] + once[:-1]) * left[:, None]
-    )
+    halfway_once = 0.5 * (once[1:] + once[:-1])
+    halfway_twice = 0.5 * (twice[1:] + twice[:-1])
+    later = once[-1] - halfway_once
+    later_way = twice[-1] - halfway_twice - halfway_once * left[:, None]
     by_rotation = -np.hstack([(force @ _SKEW).reshape(-1, 3, 3) for force in (later_way, later)])
     return by_bias, by_rotation @ halfway * steps[:, None, None]
 
 
 def inertial_motion(
-    gyro: GyroSegment, forces: ForceSegment, frame1: FrameImu, frame2: FrameImu, config: ImuConfig
+    since: ImuSlice, first: FrameImu, second: FrameImu, config: ImuConfig
 ) -> InertialMotion | str:
-    """Motion of the IMU between the stamped rows of two frames, or the reason for none."""
-    first, second, sigma = frame1.force, frame2.force, frame2.gravity_sigma
-    if isinstance(first, str):
-        return first
-    if isinstance(second, str):
-        return second
-    if frame2.motion.gravity is None or sigma is None:
+    """Motion of the IMU between the stamped rows of two frames, or the reason for none.
+
+    `since`: the samples from the first frame's row to the second one's.
+    """
+    sigma = second.gravity_sigma
+    if reason := since.no_force or first.no_force or second.no_force:
+        return reason
+    if second.motion.gravity is None or sigma is None:
         return 'the direction of gravity is not known'
-    seconds, rates, specific = _resampled(gyro, forces)
+    seconds, rates, forces = since.at_common_times()
     R = integrated_rotations(seconds, rates)[-1]
-    # As measured by the accelerometer: its scale and bias along gravity cancel. Of the second
-    # frame, with more samples before it.
-    down = R @ frame2.motion.gravity
+    # Gravity as the accelerometer measures it: its scale and its bias along gravity cancel. The
+    # filter has had more samples at the second frame.
+    down = R @ second.motion.gravity
     down /= np.linalg.norm(down)
     along = np.outer(down, down)
     gravity = second.at_rest * down
-    covariance = (second.at_rest * sigma) ** 2 * (
-        np.eye(3) - along
-    ) + second.at_rest_sigma**2 * along
+    across_variance = (second.at_rest * sigma) ** 2
+    spread = across_variance * (np.eye(3) - along) + second.at_rest_sigma**2 * along
+    position = np.array(config.imu_position)
     motion = preintegrate(
-        seconds,
-        rates,
-        specific,
-        gravity,
-        covariance,
-        np.array(config.imu_position),
-        config,
-        gyro.bias_sigma,
+        seconds, rates, forces, gravity, spread, position, config, since.bias_sigma
     )
     return validate.replaced(
-        motion, acceleration1=first.within + gravity, acceleration2=R @ second.within + gravity
-    )
-
-
-def _resampled(gyro: GyroSegment, forces: ForceSegment) -> tuple[Array, Array, Array]:
-    """Times [s], rates and forces of two segments with the same begin and end."""
-    start_ns = min(gyro.stamps_ns[0], forces.stamps_ns[0])
-    return at_common_times(
-        (gyro.stamps_ns - start_ns) * 1e-9,
-        gyro.angular_velocities,
-        (forces.stamps_ns - start_ns) * 1e-9,
-        forces.forces,
+        motion, acceleration1=first.force + gravity, acceleration2=R @ second.force + gravity
     )
 
 
 def motions_on_the_way(
-    whole: InertialMotion, first: FrameImu, since: FrameImu, frames: Sequence[FrameImu]
+    whole: InertialMotion, first: FrameImu, since: ImuSlice, frames: Sequence[FrameImu]
 ) -> list[InertialMotion | None]:
     """Parts of the motion `whole` up to frames before the last one; None without accelerometer.
 
-    `since`: IMU data of the last frame since the first. The covariances are zero.
+    `since`: the samples from the first frame to the last one. The covariances are zero.
     """
-    gyro, force = since.since_previous, since.force
-    if gyro is None or isinstance(force, str) or isinstance(first.force, str):
+    if since.no_force or first.no_force:
         return [None] * len(frames)
-    seconds, rates, specific = _resampled(gyro, force.since_previous)
+    seconds, rates, forces = since.at_common_times()
     rotations = integrated_rotations(seconds, rates)
-    once, twice = force_integrals(np.diff(seconds), np.einsum('kij,kj->ki', rotations, specific))
-    gravity = np.asarray(whole.acceleration1) - first.force.within
-    motions: list[InertialMotion | None] = []
-    for frame in frames:
-        if isinstance(frame.force, str):
-            motions.append(None)
-            continue
+    once, twice = force_integrals(np.diff(seconds), np.einsum('kij,kj->ki', rotations, forces))
+    gravity = np.asarray(whole.acceleration1) - first.force
+
+    def up_to(frame: FrameImu) -> InertialMotion | None:
+        if frame.no_force:
+            return None
         duration = seconds_between(first.reference_ns, frame.reference_ns)
-        # The stamped rows of all frames are samples of the segments.
+        # The stamped rows of all frames are samples of the slice.
         k = int(np.argmin(np.abs(seconds - seconds[0] - duration)))
-        motions.append(
-            validate.replaced(
-                whole,
-                alpha=twice[k] + 0.5 * duration**2 * gravity,
-                beta=once[k] + duration * gravity,
-                duration=duration,
-                covariance=np.zeros((6, 6)),
-                acceleration2=rotations[k] @ frame.force.within + gravity,
-            )
+        return validate.replaced(
+            whole,
+            alpha=twice[k] + 0.5 * duration**2 * gravity,
+            beta=once[k] + duration * gravity,
+            duration=duration,
+            covariance=np.zeros((6, 6)),
+            acceleration2=rotations[k] @ frame.force + gravity,
         )
-    return motions
+
+    return [up_to(frame) for frame in frames]

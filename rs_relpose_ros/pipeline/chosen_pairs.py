@@ -14,9 +14,9 @@ from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
-from rs_relpose_ros.imu.integration import FrameImu
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import pair
-from rs_relpose_ros.pipeline.pair import Frame, GyroRotation, PairResult, TrackHistory, used_frames
+from rs_relpose_ros.pipeline.pair import Frame, PairResult, TrackHistory, used_frames
 from rs_relpose_ros.pipeline.pipeline import Processor
 from rs_relpose_ros.tracking.features import DescriptorTracker
 
@@ -57,6 +57,7 @@ def view_frame(
             None if since is None else since.imu.reference_ns,
             clock.exposure(),
         ),
+        exposure=clock.exposure(),
     )
 
 
@@ -100,18 +101,18 @@ def estimate_wide_pair(
         replace(tracking, detector='sift') if tracking.detector == 'klt' else tracking
     )
     tracker.start(first.image)
-    gyro = _gyro(first, second, parameters)
+    gyro = _gyro(first, second)
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
     inertial = (
-        pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
+        pair.inertial_of(first.imu, second.imu, gyro, parameters)
         if near
         else ('the frames are further apart than max_keyframe_interval')
     )
     history = TrackHistory(first.imu)
     if gyro is not None and near:
         for frame in used_frames(between):
-            rotation = _gyro(first, frame, parameters)
+            rotation = _gyro(first, frame)
             if rotation is not None and frame.intrinsics == first.intrinsics:
                 history.add(frame.imu, rotation, tracker.track(frame.image))
     matches = tracker.track(second.image)
@@ -127,7 +128,7 @@ def estimate_wide_pair(
         inertial,
         parameters,
         interval=interval if near else None,
-        between=() if gyro is None else history.between(matches, sensor, second.imu, inertial),
+        between=() if gyro is None else history.between(matches, sensor, inertial),
     )
     rays1, rays2 = (
         pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
@@ -136,12 +137,12 @@ def estimate_wide_pair(
     return pair.pair_result(first, second, matches, rays1, rays2, pose, gyro, sensor, parameters)
 
 
-def _gyro(first: Frame[Any], frame: Frame[Any], parameters: Parameters) -> GyroRotation | None:
-    """Rotation since the first frame; None if the frame's gyro begins at another one."""
-    segment = frame.imu.since_previous
-    if segment is None or segment.stamps_ns[0] != first.imu.reference_ns:
+def _gyro(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
+    """The IMU since the first frame; None if the frame's samples begin at another one."""
+    since = frame.imu.since_previous
+    if since is None or since.stamps_ns[0] != first.imu.reference_ns:
         return None
-    return GyroRotation.of(frame.imu, parameters.imu)
+    return since
 
 
 # Of the earlier and of the later image of a pair [ns].
@@ -207,17 +208,14 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         """Of an earlier frame and the current one."""
 
         def since_first(frame: Frame[Any]) -> Frame[Any]:
-            return replace(
-                frame,
-                imu_data=reduce(
-                    pair.joined,
-                    [
-                        imu
-                        for stamp_ns, imu in self._imus.items()
-                        if first_ns < stamp_ns <= frame.stamp_ns
-                    ],
-                ),
-            )
+            slices = [
+                imu.since_previous
+                for stamp_ns, imu in self._imus.items()
+                if first_ns < stamp_ns <= frame.stamp_ns
+            ]
+            known = [one for one in slices if one is not None]
+            since = reduce(ImuSlice.joined, known) if len(known) == len(slices) else None
+            return replace(frame, imu_data=replace(frame.imu, since_previous=since))
 
         between = [frame for stamp_ns, frame in self._recent.items() if stamp_ns > first_ns]
         try:

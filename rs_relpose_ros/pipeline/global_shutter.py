@@ -25,7 +25,7 @@ from rs_relpose_ros.geometry.timing import Sensor, to_nanoseconds
 from rs_relpose_ros.pipeline.assessment import Configured
 from rs_relpose_ros.pipeline.findings import Assessment, DEVIATIONS
 from rs_relpose_ros.pipeline.monitor import ConsistencyMonitor
-from rs_relpose_ros.pipeline.pair import Frame, GyroRotation
+from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, Pipeline, Processor
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.warm_up import made_up_frames, MADE_UP_SENSOR, warm_up_pipeline
@@ -222,7 +222,7 @@ class Unroller(Processor[GlobalShutterFrame]):
         reference_ns = imu.reference_ns
         if parameters.global_shutter.stamp_clock == 'camera':
             reference_ns = frame.stamp_ns + to_nanoseconds(
-                timing.exposure_shift(sensor.stamp_exposure, imu.exposure) + model.pose_row_delay
+                timing.exposure_shift(sensor.stamp_exposure, frame.exposure) + model.pose_row_delay
             )
         return GlobalShutterFrame(
             reference_ns + to_nanoseconds(self._middle.delay),
@@ -234,7 +234,7 @@ class Unroller(Processor[GlobalShutterFrame]):
             self._middle,
             imu.motion,
             parameters.global_shutter.border,
-            imu.applied_offset_ns,
+            frame.applied_offset_ns,
             self._follower.health,
         )
 
@@ -270,12 +270,13 @@ class RotationWatch(Processor[None]):
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> None:
         """Follow points into a frame."""
-        self._monitor.ahead.append(frame.imu.ahead)
+        self._monitor.ahead.append(frame.ahead)
         begin = self._begin
+        since = frame.imu.since_previous
         if (
             self._tracker is None
             or begin is None
-            or frame.imu.since_previous is None
+            or since is None
             or frame.intrinsics != begin.intrinsics
         ):
             self._tracker = self._tracker or make_tracker(parameters.tracking)
@@ -297,7 +298,7 @@ class RotationWatch(Processor[None]):
                 frame.stamp_ns,
                 timing.seconds_between(begin.stamp_ns, frame.stamp_ns),
                 by_images,
-                log_so3(GyroRotation.of(frame.imu, parameters.imu).rotation),
+                log_so3(since.rotation),
             )
         self._monitor.add_pair(
             frame.stamp_ns,

@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.config.settings import ImuConfig, KeyframeConfig, Parameters
+from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import velocity
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
@@ -28,7 +28,7 @@ from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
 from rs_relpose_ros.geometry.timing import seconds_between, Sensor, to_nanoseconds
 from rs_relpose_ros.imu import integration
-from rs_relpose_ros.imu.integration import FrameImu, GyroSegment, motions_on_the_way
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, motions_on_the_way
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -54,6 +54,9 @@ class Frame(Generic[Result]):
     frame_id: str
     intrinsics: Intrinsics
     imu_data: FrameImu | None = None
+    exposure: float = 0.0  # of a row [s], over which the gyro is averaged
+    applied_offset_ns: int = 0  # tracked time offset in its IMU data, beyond the parameter's
+    ahead: float = 0.0  # [s] newest stamp of the gyro as the image came, less the stamped row's
     # For derotated images, whose `image` is (H, W) or (H, W, C) in its own encoding.
     encoding: str = 'mono8'
     encoded: EncodedImage | None = None
@@ -254,73 +257,26 @@ _LARGEST_GRAVITY_SIGMA = 1.5
 _LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroRotation:
-    """``R_1^T R_2`` of two frames by the gyro, its covariance, and the integrated samples."""
-
-    rotation: Array
-    covariance: Array
-    segment: GyroSegment
-
-    @classmethod
-    def of(cls, imu: FrameImu, config: ImuConfig) -> GyroRotation:
-        """Rotation since the frame before, if there was no gap."""
-        segment = imu.since_previous
-        assert segment is not None
-        return cls(
-            *integration.integrate_rotation(
-                segment.stamps_ns, segment.angular_velocities, config, segment.bias_sigma
-            ),
-            segment,
-        )
-
-
 def interval_of(first: FrameImu, second: FrameImu) -> float:
     """Seconds between the stamped rows of two frames."""
     return seconds_between(first.reference_ns, second.reference_ns)
 
 
-def joined(before: FrameImu, imu: FrameImu) -> FrameImu:
-    """IMU data of the second of two consecutive frames, with gyro and force since `before`'s."""
-    if before.since_previous is None or imu.since_previous is None:
-        return replace(imu, since_previous=None)
-    force = imu.force
-    if not isinstance(force, str):
-        force = (
-            before.force
-            if isinstance(before.force, str)
-            else replace(
-                force, since_previous=before.force.since_previous.joined(force.since_previous)
-            )
-        )
-    return replace(
-        imu, since_previous=before.since_previous.joined(imu.since_previous), force=force
-    )
-
-
 def inertial_of(
-    first: FrameImu,
-    second: FrameImu,
-    gyro: GyroRotation | None,
-    since: FrameImu,
-    parameters: Parameters,
+    first: FrameImu, second: FrameImu, since: ImuSlice | None, parameters: Parameters
 ) -> InertialMotion | str:
     """Motion of a pair by the accelerometer, or the reason why it is not known.
 
-    `gyro` and the force of `since` extend from frame to frame.
+    `since` extends from the first frame to the second one.
     """
     if not parameters.pair.use_accelerometer:
         return 'use_accelerometer is false'
     if not parameters.pair.use_gyro_rotation:
         # The gyro rotates the specific force.
         return 'use_gyro_rotation is false'
-    if gyro is None:
+    if since is None:
         return 'the gyro has a gap'
-    if isinstance(since.force, str):
-        return since.force
-    return integration.inertial_motion(
-        gyro.segment, since.force.since_previous, first, second, parameters.imu
-    )
+    return integration.inertial_motion(since, first, second, parameters.imu)
 
 
 def estimate_pair(
@@ -329,7 +285,7 @@ def estimate_pair(
     stamps_ns: tuple[int, int],
     matches: Matches,
     sensor: Sensor,
-    gyro: GyroRotation | None,
+    gyro: ImuSlice | None,
     inertial: InertialMotion | str,
     parameters: Parameters,
     *,
@@ -375,7 +331,7 @@ def evidence_without(
     first: FrameImu,
     second: FrameImu,
     sensor: Sensor,
-    gyro: GyroRotation,
+    gyro: ImuSlice,
     inertial: InertialMotion,
     parameters: Parameters,
 ) -> velocity.InertialEvidence | None:
@@ -398,7 +354,7 @@ def evidence_without(
 
 
 def parallax_of(
-    rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroRotation | None, sensor: Sensor
+    rays1: DerotatedRays, rays2: DerotatedRays, gyro: ImuSlice | None, sensor: Sensor
 ) -> float:
     """Median parallax [px] of matched rays after derotation."""
     rotation = aligning_rotation(rays1.rays.T @ rays2.rays) if gyro is None else gyro.rotation
@@ -412,7 +368,7 @@ def pair_result(
     rays1: DerotatedRays,
     rays2: DerotatedRays,
     pose: RelativePose,
-    gyro: GyroRotation | None,
+    gyro: ImuSlice | None,
     sensor: Sensor,
     parameters: Parameters,
 ) -> PairResult:
@@ -445,7 +401,7 @@ def pair_result(
         parallax=parallax_of(rays1, rays2, gyro, sensor),
         landmarks_of=points if pose else None,
         gyro_rotation=None if gyro is None else gyro.rotation,
-        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias,
+        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.bias,
     )
 
 
@@ -485,7 +441,7 @@ class _TrackedFrame(NamedTuple):
     """A frame after the reference."""
 
     imu: FrameImu
-    gyro: GyroRotation  # since the reference
+    gyro: ImuSlice  # since the reference
     matches: Matches  # as tracked
 
 
@@ -496,16 +452,16 @@ class TrackHistory:
         self._reference = reference
         self._frames: list[_TrackedFrame] = []
 
-    def add(self, imu: FrameImu, gyro: GyroRotation, matches: Matches) -> None:
+    def add(self, imu: FrameImu, gyro: ImuSlice, matches: Matches) -> None:
         """Add the current frame with its tracks."""
         self._frames.append(_TrackedFrame(imu, gyro, matches))
 
     def between(
-        self, matches: Matches, sensor: Sensor, since: FrameImu, inertial: InertialMotion | str
+        self, matches: Matches, sensor: Sensor, inertial: InertialMotion | str
     ) -> list[IntermediateFrame]:
         """Frames between the reference and the last one, with the tracks of a pair's `matches`.
 
-        `since`: IMU data of the last frame since the reference; `inertial`: motion of the pair.
+        `inertial`: motion of the pair.
         """
         *before, last = self._frames
         chosen = used_frames(before)
@@ -513,7 +469,7 @@ class TrackHistory:
         if not isinstance(inertial, str):
             motions = list(
                 motions_on_the_way(
-                    inertial, self._reference, since, [frame.imu for frame in chosen]
+                    inertial, self._reference, last.gyro, [frame.imu for frame in chosen]
                 )
             )
         drift = matches.points2 - _points(last.matches, matches)

@@ -18,14 +18,13 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
-from rs_relpose_ros.imu.integration import FrameImu, rotation_sensitivity
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, rotation_sensitivity
 from rs_relpose_ros.pipeline import findings, pair
 from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
 from rs_relpose_ros.pipeline.pair import (
     DerotatedRays,
     Frame,
-    GyroRotation,
     PairResult,
     Result,
     TrackHistory,
@@ -106,7 +105,7 @@ class Pipeline(Processor[PairResult]):
         self._stamps_ns.clear()
         self._reference: Frame[Any] | None = None
         self._previous: Frame[Any] | None = None
-        self._since: FrameImu | None = None  # of the last frame, since the reference
+        self._since: ImuSlice | None = None  # from the reference to the last frame
         self._frames = 0  # since the reference
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
@@ -128,7 +127,7 @@ class Pipeline(Processor[PairResult]):
             self._current_rays = None  # their row times are those of the camera before
         self._sensor, self._readout, imu = sensor, self.applied.readout_time, frame.imu
         self._stamps_ns.append(frame.stamp_ns)
-        self._monitor.ahead.append(imu.ahead)
+        self._monitor.ahead.append(frame.ahead)
         reference, previous = self._reference, self._previous
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if reference is None or previous is None or imu.since_previous is None:
@@ -136,14 +135,16 @@ class Pipeline(Processor[PairResult]):
             self._restart_from(frame)
             return None
         self._frames += 1
-        rotation = GyroRotation.of(imu, parameters.imu).rotation
+        rotation = imu.since_previous.rotation
         predicted = self._predicted(previous.imu.motion, imu.motion, rotation, sensor)
         matches = self._tracker.track(
             frame.image, predicted, seconds_between(previous.stamp_ns, frame.stamp_ns)
         )
         self._previous = frame
-        self._since = imu if self._since is None else pair.joined(self._since, imu)
-        gyro = GyroRotation.of(self._since, parameters.imu)
+        gyro = (
+            imu.since_previous if self._since is None else self._since.joined(imu.since_previous)
+        )
+        self._since = gyro
         self._history.add(imu, gyro, matches)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, imu.motion, sensor)
         keyframe = pair.is_keyframe(
@@ -260,7 +261,7 @@ class Pipeline(Processor[PairResult]):
         self,
         reference: Frame[Any],
         frame: Frame[Any],
-        gyro: GyroRotation,
+        gyro: ImuSlice,
         sensor: Sensor,
         parameters: Parameters,
     ) -> PairResult:
@@ -275,7 +276,7 @@ class Pipeline(Processor[PairResult]):
             sensor,
             parameters,
         )
-        measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
+        measurement, to_sensor = None, sensor.intrinsics.to_sensor
         fitted = pose.rejected or pose  # a contradiction shows what is wrong
         if np.isfinite(fitted.R).all():
             measurement = PairData(
@@ -289,10 +290,8 @@ class Pipeline(Processor[PairResult]):
                 fitted.t,
                 gyro.rotation,
                 gyro.covariance,
-                rotation_sensitivity(
-                    segment.stamps_ns, segment.angular_velocities, parameters.imu
-                ),
-                segment,
+                rotation_sensitivity(gyro.stamps_ns, gyro.angular_velocities, gyro.noise_density),
+                gyro,
                 parameters.sensor.R_cam_imu,
                 parameters.estimator.gyro_sigma,
             )
@@ -309,9 +308,9 @@ class Pipeline(Processor[PairResult]):
             active,
             parameters.intrinsics.principal_point_sigma,
         )
-        active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
+        active[findings.OFFSET] = frame.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
-        active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
+        active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ gyro.bias - bias
         assessed = monitor.add_pair(frame.stamp_ns, measurement, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
@@ -338,13 +337,12 @@ class Pipeline(Processor[PairResult]):
         second: FrameImu,
         stamps_ns: tuple[int, int],
         matches: Matches,
-        gyro: GyroRotation,
+        gyro: ImuSlice,
         sensor: Sensor,
         parameters: Parameters,
     ) -> RelativePose:
         """The pose, without the accelerometer if the images contradict it."""
-        since, history, sigma = self._since, self._history, stamp_sigma(self._stamps_ns)
-        assert since is not None
+        history, sigma = self._history, stamp_sigma(self._stamps_ns)
 
         def estimate(inertial: InertialMotion | str) -> RelativePose:
             return pair.estimate_pair(
@@ -358,10 +356,10 @@ class Pipeline(Processor[PairResult]):
                 parameters,
                 interval=pair.interval_of(first, second),
                 stamp_sigma=sigma,
-                between=history.between(matches, sensor, since, inertial),
+                between=history.between(matches, sensor, inertial),
             )
 
-        inertial = pair.inertial_of(first, second, gyro, since, parameters)
+        inertial = pair.inertial_of(first, second, gyro, parameters)
         acceleration = self._monitor.acceleration
         acceleration.report(stamps_ns[1], inertial)
         if isinstance(inertial, str):

@@ -28,7 +28,7 @@ from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
-from rs_relpose_ros.imu.integration import GyroSegment, RotationSensitivity
+from rs_relpose_ros.imu.integration import ImuSlice, RotationSensitivity
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline import findings
 from rs_relpose_ros.pipeline.findings import AXES, BIAS, DEVIATIONS, FOCAL, OFFSET, READOUT
@@ -67,7 +67,7 @@ class PairData:
     gyro_rotation: Array  # (3, 3) between the stamped rows
     gyro_covariance: Array  # (3, 3) of that, as in the estimate
     gyro_sensitivity: RotationSensitivity  # of that
-    segment: GyroSegment  # of that
+    segment: ImuSlice  # of that
     R_cam_imu: Array
     gyro_sigma: float  # [rad/s] of the rate within a frame
 
@@ -383,7 +383,7 @@ def middle_share(camera: RollingShutterCamera) -> float:
 _TIMES = [OFFSET, READOUT]
 
 
-def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> PairData | None:
+def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairData | None:
     """The pair with rows at the times of OFFSET and READOUT, not yet fitted.
 
     `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.

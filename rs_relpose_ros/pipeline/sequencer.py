@@ -299,6 +299,8 @@ class Sequencer:
                 head.intrinsics,
                 encoding=encoding,
                 encoded=image if self._colors else None,
+                exposure=head.exposure,
+                ahead=head.ahead,
                 ready_ns=head.ready_ns or 0,
                 taken_ns=taken_ns,
             )
@@ -322,18 +324,15 @@ class Sequencer:
             reference_ns, previous_ns = head.reference_ns + self._offset_ns, self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
-            frame.imu_data = replace(
-                frame_imu(
-                    self._buffer,
-                    span_ns,
-                    reference_ns,
-                    self._R_cam_imu,
-                    previous_ns,
-                    head.exposure,
-                    gyro_only=self.gyro_only,
-                ),
-                applied_offset_ns=self._offset_ns,
-                ahead=head.ahead,
+            frame.applied_offset_ns = self._offset_ns
+            frame.imu_data = frame_imu(
+                self._buffer,
+                span_ns,
+                reference_ns,
+                self._R_cam_imu,
+                previous_ns,
+                head.exposure,
+                gyro_only=self.gyro_only,
             )
             frame.restart = self._taken_generation != self._generation
             self._previous_ns, self._taken_generation = reference_ns, self._generation
