@@ -56,7 +56,8 @@ lint: $(test_stamp)
 # Removed, a sixth of the environment: the libraries' own tests, GTSAM's data sets, headers, and two
 # of three copies of Fast DDS, which are links outside a wheel.
 $(stamp): export PYTHONDONTWRITEBYTECODE :=
-$(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py setup.cfg
+$(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py setup.cfg \
+    rs_relpose_lab/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
 	@echo 'Setting up $(VENV): a minute or two and 0.8 GB.'
@@ -71,7 +72,7 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 	find $(VENV)/lib -maxdepth 1 '(' -name libfastrtps.so -o -name 'libfastrtps.so.*.*.*' ')' -delete && \
 	$(bin)/python -c 'import $(first_run)'; \
 	installed=$$?; wait $$kernels; exit $$installed
-	$(pip) install --no-deps --no-build-isolation --editable .
+	$(pip) install --no-deps --no-build-isolation --editable . --editable ./rs_relpose_lab
 	touch $@
 
 $(test_stamp): $(stamp) requirements/test.txt
@@ -89,7 +90,7 @@ same-python:
 	    { echo '$(VENV) was made with another Python: make distclean, or choose VENV=...' >&2; exit 1; }
 
 clean:
-	rm -rf build install log dist demo_out *.egg-info \
+	rm -rf build install log dist demo_out *.egg-info rs_relpose_lab/*.egg-info rs_relpose_lab/build \
 	    .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name '.venv*' -prune -o -name __pycache__ -type d -exec rm -rf {} +
 

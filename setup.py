@@ -11,7 +11,7 @@ from setuptools.command.build_py import build_py
 from setuptools.command.develop import develop
 
 NAME = 'rs_relpose_ros'
-LABORATORY = 'rs_relpose_lab'
+VERSION = '0.1.0'
 # Module -> call in it that compiles the kernels of a node with its default parameters.
 WARM_UPS = {
     'pipeline.warm_up': 'cache_is_filled() or module.fill_cache()',
@@ -30,6 +30,14 @@ def libraries() -> list[str]:
     """Run-time dependencies from PyPI: requirements/base.txt without ROS and the build tool."""
     lines = Path('requirements', 'base.txt').read_text().splitlines()
     return [line for line in lines if not line.startswith(('#', 'ros-', 'setuptools'))]
+
+
+def laboratory() -> str:
+    """Requirement of the extra `lab`: the folder in this checkout, which no index offers."""
+    folder = Path(__file__).resolve().with_name('rs_relpose_lab')
+    if (folder / 'pyproject.toml').exists():
+        return f'rs_relpose_lab @ {folder.as_uri()}'
+    return f'rs_relpose_lab=={VERSION}'
 
 
 def compile_kernels(folder: str) -> None:
@@ -85,14 +93,14 @@ class DevelopWithKernels(develop):
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=VERSION,
     description='Relative pose of two rolling-shutter images, aided by an IMU',
     maintainer='rs_relpose_ros maintainers',
     maintainer_email='maintainers@users.noreply.h-seed-7badc013.example',
     license='Apache-2.0',
     python_requires='>=3.11',
-    packages=find_packages(include=[NAME, NAME + '.*', LABORATORY, LABORATORY + '.*']),
-    package_data={NAME: ['py.typed'], LABORATORY: ['py.typed', 'recordings/*.yaml']},
+    packages=find_packages(include=[NAME, NAME + '.*']),
+    package_data={NAME: ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         ('share/' + NAME, ['package.xml']),
@@ -104,6 +112,8 @@ setup(
     # and would install that, and perhaps another NumPy, over Ubuntu's.
     install_requires=['setuptools', *libraries()],
     extras_require={
+        # Simulator, live measurements, experiments: simulate, benchmark and evaluate.
+        'lab': [laboratory()],
         'test': ['pytest'],
         'odometry': ['gtsam>=4.3,<4.4'],
         'video': ['av>=13,<19', 'telemetry-parser>=0.3,<0.4'],

@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from types import SimpleNamespace
 
 from conftest import ROOT
@@ -94,7 +95,10 @@ def module_behind(name: str) -> str:
 def test_versions_agree(capsys):
     manifest = (ROOT / 'package.xml').read_text()
     assert re.search(r'<version>(.*?)</version>', manifest)[1] == VERSION
-    assert re.search(r"version='(.*?)'", (ROOT / 'setup.py').read_text())[1] == VERSION
+    assert re.search(r"VERSION = '(.*?)'", (ROOT / 'setup.py').read_text())[1] == VERSION
+    laboratory = tomllib.loads((ROOT / LABORATORY / 'pyproject.toml').read_text())['project']
+    assert laboratory['version'] == VERSION
+    assert laboratory['dependencies'] == [f'{NAME}=={VERSION}']
     releases = re.findall(
         r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$',
         (ROOT / 'CHANGELOG.rst').read_text(),
@@ -552,6 +556,15 @@ def test_everything_is_installed_and_found(install_space):
         )
     ]
     assert missing == []
+    # The laboratory is another distribution, which a robot does not carry.
+    assert not (library.parent / LABORATORY).exists()
+
+
+def test_the_laboratory_lists_all_its_packages():
+    described = tomllib.loads((ROOT / LABORATORY / 'pyproject.toml').read_text())
+    folders = {path.parent for path in (ROOT / LABORATORY).rglob('__init__.py')}
+    found = {'.'.join(path.relative_to(ROOT).parts) for path in folders}
+    assert set(described['tool']['setuptools']['packages']) == found
 
 
 def test_first_start_compiles_nothing_and_the_command_line_runs(install_space):

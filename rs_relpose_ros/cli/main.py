@@ -65,7 +65,11 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     ),
 }
 
-LABORATORY = 'the package rs_relpose_lab, which is not installed'
+# What a command of the laboratory lacks where only this package is installed.
+LABORATORY = (
+    'the package rs_relpose_lab, which is not installed: '
+    '"pip install \'rs_relpose_ros[lab]\'", or in a checkout "pip install ./rs_relpose_lab"'
+)
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
