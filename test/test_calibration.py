@@ -52,7 +52,8 @@ from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, paramet
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.

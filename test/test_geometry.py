@@ -131,6 +131,65 @@ def test_opencv_projects_the_ray_back_to_its_pixel(model, distortion):
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=1e-9)
 
 
+@pytest.mark.parametrize('method', ['points_by_lens', 'rays_by_lens'])
+@pytest.mark.parametrize(('model', 'distortion'), MODELS)
+def test_derivatives_by_the_lens_equal_finite_differences(model, distortion, method):
+    camera = make_camera(model, distortion)
+    # On the axis and beside it, where the profile of the fisheye is a series.
+    centre = np.array([camera.cx, camera.cy])
+    near = centre + np.array([[0.0, 0.0], [1e-6, 0.0], [0.01, 0.02]])
+    pixels = np.vstack([PIXELS, near])
+
+    def values(deviation, pixels=pixels):
+        moved = getattr(camera.moved_lens(np.array(deviation)), method)(pixels)
+        return moved.values, moved.by_pixel
+
+    found = getattr(camera, method)(pixels)
+    steps = [1e-6] * 5 + [1e-3] * 2
+    for q, step in enumerate(np.diag(steps)):
+        (ahead, ahead_by_pixel), (behind, behind_by_pixel) = values(step), values(-step)
+        for analytic, change in (
+            (found.by_lens[..., q], ahead - behind),
+            (found.by_pixel_by_lens[..., q], ahead_by_pixel - behind_by_pixel),
+        ):
+            numeric = change / (2.0 * steps[q])
+            np.testing.assert_allclose(analytic, numeric, atol=1e-6 * np.abs(numeric).max())
+    for j, step in enumerate(1e-3 * np.eye(2)):
+        change = values(np.zeros(7), pixels + step)[0] - values(np.zeros(7), pixels - step)[0]
+        np.testing.assert_allclose(found.by_pixel[..., j], change / 2e-3, atol=1e-11)
+    rays, jacobian = camera.unproject_with_jacobian(pixels)
+    if method == 'rays_by_lens':
+        np.testing.assert_array_equal(found.values, rays)
+        np.testing.assert_array_equal(found.by_pixel, jacobian)
+    else:
+        np.testing.assert_allclose(found.values, rays[:, :2] / rays[:, 2:], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('model', 'distortion', 'moved'),
+    [
+        ('plumb_bob', (), (0.1, 0.0, 0.0, 0.0)),
+        ('plumb_bob', (0.1, 0.2, 0.3, 0.4), (0.2, 0.2, 0.3, 0.4)),
+        ('rational_polynomial', (), (0.1,) + (0.0,) * 7),
+        ('equidistant', (0.1, 0.2, 0.3, 0.4), (0.2, 0.2, 0.3, 0.4)),
+    ],
+)
+def test_lens_moved_by_a_deviation(model, distortion, moved):
+    camera = make_camera(model, distortion)
+    deviation = np.array([0.01, 0.02, 0.1, 0.0, 0.0, 3.0, -2.0])
+    other = camera.moved_lens(deviation)
+    assert other.distortion == pytest.approx(moved)
+    assert other.fx == pytest.approx(camera.fx * np.exp(0.01))
+    assert other.fy / other.fx == pytest.approx(camera.fy / camera.fx * np.exp(0.02))
+    assert (other.cx, other.cy) == (camera.cx + 3.0, camera.cy - 2.0)
+    deviation[4] = 0.5
+    third = {'plumb_bob': 4, 'rational_polynomial': 4, 'equidistant': 2}[model]
+    assert camera.moved_lens(deviation).distortion[third] == pytest.approx(
+        0.5 + (distortion[third] if len(distortion) > third else 0.0)
+    )
+    assert camera.moved_lens(np.zeros(7)) == camera
+
+
 def test_no_mirror_images():
     """Neither beyond the invertible region of the distortion, nor behind the camera."""
     # The search diverges, or it converges where the distorted radius decreases.

@@ -35,7 +35,8 @@ from rs_relpose_ros.bags.convert import read_rows
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import rays_with_jacobian, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.lens import rays_with_jacobian
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer, ImuSample

@@ -20,7 +20,8 @@ from rs_relpose_ros.calibrate import coplanarity as model
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays

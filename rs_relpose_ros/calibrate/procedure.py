@@ -22,7 +22,8 @@ from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEst
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages

@@ -20,7 +20,8 @@ from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.files import read_parameters, write_parameters
 from rs_relpose_ros.errors import InputError, library, MissingInputError
-from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport
 from rs_relpose_ros.offline.unroll import unroll

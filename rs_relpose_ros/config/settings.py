@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import camera, validate
-from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, Intrinsics
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor, STAMP_EXPOSURES
 from rs_relpose_ros.solvers.api import SOLVERS
 

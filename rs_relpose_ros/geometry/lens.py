@@ -1,0 +1,484 @@
+"""Lenses: distortion of normalised points, its inverse, and its derivatives.
+
+A point of the camera frame at depth z has the normalised coordinates ``n = (x, y) / z``. The lens
+moves it to ``d = D(n)``, and the raw pixel is ``u = cx + fx d_x, v = cy + fy d_y``. All models
+have one form: a radial profile R of their own, and the tangential and thin-prism terms of OpenCV,
+
+    D(n) = R(|n|^2) n + tangential(n) + prism(n)
+
+To add a model, write the kernel of its profile and its row of `DISTORTION_MODELS`. The camera, the
+calibrations and the checks use these two only.
+
+``cv2.undistortPoints`` is not used: it stops after five fixed-point steps, with errors of pixels
+if the distortion is strong, and the calls that iterate longer differ between OpenCV 4 and 5.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.so3 import dot
+from rs_relpose_ros.jit import kernel, KernelInterface
+
+# -- Deviations of a lens -------------------------------------------------------------------------
+
+# Entries of a deviation of the lens (true minus assumed) and their sizes, in the order of all
+# derivatives by the lens: logarithm of both focal lengths; logarithm of fy / fx, which moves fy;
+# radial coefficients k1, k2, k3; principal point cx, cy [px].
+LENS_ENTRIES = (('focal_log', 1), ('aspect', 1), ('distortion', 3), ('principal_point', 2))
+# Number of values of a deviation of the lens. [derived: sum of the sizes above]
+N_LENS = 7
+# Number of the radial coefficients that have derivatives. [derived: size of 'distortion']
+_N_RADIAL = 3
+# First index of the radial coefficients. [derived: sizes of the entries before them]
+_DISTORTION = 2
+
+
+class ByLens(NamedTuple):
+    """What pixels see, as vectors of C components, and its derivatives.
+
+    The vectors are unit rays (C = 3) or normalised points (C = 2). The last axis of size 7 has the
+    order of `LENS_ENTRIES`.
+    """
+
+    values: Array  # (N, C)
+    by_pixel: Array  # (N, C, 2) [1/px]
+    by_lens: Array  # (N, C, 7)
+    by_pixel_by_lens: Array  # (N, C, 2, 7) derivative of `by_pixel` by the lens
+
+
+# -- Distortion models by name --------------------------------------------------------------------
+
+# Values that the kernel of a profile writes: R, 2 R' and 4 R'', where the derivatives are by the
+# squared radius s; then G and 2 G' of each of k1, k2, k3, where G = dR/dk. [derived: 3 + 2 * 3]
+_PROFILE = 3 + 2 * _N_RADIAL
+
+
+@kernel
+def fisheye_profile(s: float, k: Array, out: Array) -> None:
+    """OpenCV's fisheye model: the angle off the axis becomes the radius.
+
+    ``R(s) = a(theta) / r`` with ``s = r^2``, ``theta = atan(r)`` and
+    ``a = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``; `k` (6,) has k1 to k4.
+    """
+    r = math.sqrt(s)
+    if r < 1e-8:  # the quotients below are 0 / 0 on the axis
+        out[0] = 1.0
+        for m in range(1, _PROFILE):
+            out[m] = 0.0
+        return
+    theta = math.atan(r)
+    t2 = theta * theta
+    wider = 1.0 + s  # d r / d theta
+    angle = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    by_theta = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
+    # The second derivative of a by theta, over theta.
+    bend = 6.0 * k[0] + t2 * (20.0 * k[1] + t2 * (42.0 * k[2] + t2 * 72.0 * k[3]))
+    out[0] = angle / r
+    out[1] = (by_theta / wider - out[0]) / s
+    by_theta_slope = (bend * theta / r - 2.0 * by_theta) / (wider * wider)
+    out[2] = (by_theta_slope - 3.0 * out[1]) / s
+    power = theta * t2  # theta^(2 m + 1) of coefficient m
+    for m in range(3):
+        gain = power / r
+        by_theta = (2 * m + 3) * power / theta
+        out[3 + 2 * m] = gain
+        out[4 + 2 * m] = (by_theta / wider - gain) / s
+        power *= t2
+
+
+def ideal_fisheye(points: Array) -> Array:
+    """Undistorted points of the ideal fisheye: from the distorted points, Newton overshoots."""
+    angles = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-8)
+    return np.asarray(points * np.tan(np.minimum(angles, 1.5)) / angles)
+
+
+@kernel
+def rational_profile(s: float, k: Array, out: Array) -> None:
+    """OpenCV's rational model, of which plumb_bob is the part without a denominator.
+
+    ``R(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)``; `k` (6,).
+    """
+    above = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
+    below = 1.0 + s * (k[3] + s * (k[4] + s * k[5]))
+    above_slope = k[0] + s * (2.0 * k[1] + s * 3.0 * k[2])
+    below_slope = k[3] + s * (2.0 * k[4] + s * 3.0 * k[5])
+    radial = above / below
+    slope = (above_slope - radial * below_slope) / below
+    above_bend = 2.0 * k[1] + 6.0 * k[2] * s
+    below_bend = 2.0 * k[4] + 6.0 * k[5] * s
+    bend = (above_bend - 2.0 * slope * below_slope - radial * below_bend) / below
+    out[0] = radial
+    out[1] = 2.0 * slope
+    out[2] = 4.0 * bend
+    power = 1.0  # s^m of coefficient m - 1
+    for m in range(3):
+        before = power
+        power *= s
+        gain = power / below
+        out[3 + 2 * m] = gain
+        out[4 + 2 * m] = 2.0 * ((m + 1) * before - gain * below_slope) / below
+
+
+# In compiled code: profile_at(address, s, k, out).
+_PROFILE_KERNEL = KernelInterface(numba.void, 0.0, np.empty(1), np.empty(1))
+profile_at = _PROFILE_KERNEL.call
+
+
+class Lens(NamedTuple):
+    """Distortion of one camera in the form that kernels take."""
+
+    profile: int  # address of the compiled kernel of the radial profile
+    radial: Array  # (6,) coefficients of the profile
+    sideways: Array  # (6,) tangential p1, p2 and thin-prism s1, s2, s3, s4
+
+
+@dataclass(frozen=True, slots=True)
+class DistortionModel:
+    """A family of lenses, and how CameraInfo orders its coefficients."""
+
+    name: str  # as in sensor_msgs/CameraInfo (REP-104)
+    coefficient_counts: tuple[int, ...]  # the legal ones, in the order of CameraInfo and OpenCV
+    # Kernel profile(s, k, out) that writes the `_PROFILE` values above; `k` (6,).
+    profile: Callable[[float, Array, Array], None]
+    radial: tuple[int, ...]  # places of the profile's coefficients in CameraInfo; k1, k2, k3 first
+    sideways: tuple[int, ...] = ()  # places of p1, p2, s1, s2, s3, s4 in CameraInfo
+    # A start of the inverse: undistorted points (N, 2) from the distorted points.
+    first_guess: Callable[[Array], Array] = np.copy
+    is_pinhole_at_zero: bool = True  # whether coefficients of zero distort nothing
+
+    def lens(self, coefficients: tuple[float, ...]) -> Lens:
+        """Make the lens with these coefficients; the coefficients that are not given are zero."""
+        given = np.zeros(12)
+        given[: len(coefficients)] = coefficients
+        radial, sideways = np.zeros(6), np.zeros(6)
+        radial[: len(self.radial)] = given[list(self.radial)]
+        sideways[: len(self.sideways)] = given[list(self.sideways)]
+        return Lens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
+
+    def moved(self, coefficients: tuple[float, ...], by: Array) -> tuple[float, ...]:
+        """Coefficients with `by` (3,) added to k1, k2, k3: as many as that needs."""
+        if not np.any(by):
+            return coefficients
+        places = self.radial[:_N_RADIAL]
+        needed = 1 + max(place for place, step in zip(places, by, strict=True) if step)
+        count = next(n for n in self.coefficient_counts if n >= max(needed, len(coefficients), 1))
+        values = np.zeros(count)
+        values[: len(coefficients)] = coefficients
+        for place, step in zip(places, by, strict=True):
+            if step:
+                values[place] += step
+        return tuple(values.tolist())
+
+
+DISTORTION_MODELS = {
+    model.name: model
+    for model in (
+        DistortionModel(
+            'plumb_bob', (0, 4, 5, 8), rational_profile, (0, 1, 4, 5, 6, 7), (2, 3, 8, 9, 10, 11)
+        ),
+        DistortionModel(
+            'rational_polynomial',
+            (8, 12),
+            rational_profile,
+            (0, 1, 4, 5, 6, 7),
+            (2, 3, 8, 9, 10, 11),
+        ),
+        DistortionModel(
+            'equidistant',
+            (4,),
+            fisheye_profile,
+            (0, 1, 2, 3),
+            first_guess=ideal_fisheye,
+            is_pinhole_at_zero=False,
+        ),
+    )
+}
+
+
+# -- Kernels of all models ------------------------------------------------------------------------
+
+# Depth below which a point does not lie in front of the camera, in the unit of the points; the
+# quotients by the depth stay finite. [chosen: any value between rounding and a millimetre]
+_NEAREST = 1e-9
+
+
+@kernel
+def distort(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
+    """Write D(x, y) and d D / d(x, y), row by row, into `out` (6,); `profile` (9,) is filled."""
+    r2 = x * x + y * y
+    profile_at(lens.profile, r2, lens.radial, profile)
+    radial, slope = profile[0], profile[1]
+    p1, p2 = lens.sideways[0], lens.sideways[1]
+    s1, s2, s3, s4 = lens.sideways[2], lens.sideways[3], lens.sideways[4], lens.sideways[5]
+    out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2)
+    out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4)
+    prism_x = s1 + 2.0 * r2 * s2
+    prism_y = s3 + 2.0 * r2 * s4
+    mixed = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+    out[2] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x + 2.0 * x * prism_x
+    out[3] = mixed + 2.0 * y * prism_x
+    out[4] = mixed + 2.0 * x * prism_y
+    out[5] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x + 2.0 * y * prism_y
+
+
+@kernel
+def project_points(points: Array, lens: Lens) -> Array:
+    """Distorted normalised points (N, 2) of points (N, 3); NaN behind the camera."""
+    out = np.empty((points.shape[0], 2))
+    profile, values = np.empty(_PROFILE), np.empty(6)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if z > _NEAREST:
+            distort(x / z, y / z, lens, profile, values)
+            out[i, 0], out[i, 1] = values[0], values[1]
+        else:
+            out[i, 0], out[i, 1] = math.nan, math.nan
+    return out
+
+
+@kernel
+def undistort_points(points: Array, first_guesses: Array, lens: Lens) -> tuple[Array, Array]:
+    """Undistorted normalised points (N, 2) and their derivatives (N, 2, 2) by the distorted ones.
+
+    NaN if there is no inverse. A root beyond the turning point of the polynomial is a mirror image
+    and not an inverse.
+    """
+    n = points.shape[0]
+    out, inverse = np.empty((n, 2)), np.empty((n, 2, 2))
+    profile, v = np.empty(_PROFILE), np.empty(6)
+    for i in range(n):
+        x, y, converged = first_guesses[i, 0], first_guesses[i, 1], False
+        for _ in range(50):
+            distort(x, y, lens, profile, v)
+            error_x, error_y = points[i, 0] - v[0], points[i, 1] - v[1]
+            determinant = v[2] * v[5] - v[3] * v[4]
+            dx = (v[5] * error_x - v[3] * error_y) / determinant
+            dy = (v[2] * error_y - v[4] * error_x) / determinant
+            length = math.sqrt(dx * dx + dy * dy)
+            # A step may not leave the region in which the model is monotonic.
+            limit = 0.5 * (1.0 + math.sqrt(x * x + y * y))
+            if length > limit:
+                dx, dy = dx * limit / length, dy * limit / length
+            x, y = x + dx, y + dy
+            # The error after a step is about its square: 1e-9 px at any focal length.
+            if length < 1e-8 * (1.0 + limit):
+                converged = True
+                break
+        distort(x, y, lens, profile, v)
+        determinant = v[2] * v[5] - v[3] * v[4]
+        if not (converged and determinant > 0.0):
+            x, y, determinant = math.nan, math.nan, math.nan
+        out[i, 0], out[i, 1] = x, y
+        inverse[i, 0, 0], inverse[i, 0, 1] = v[5] / determinant, -v[3] / determinant
+        inverse[i, 1, 0], inverse[i, 1, 1] = -v[4] / determinant, v[2] / determinant
+    return out, inverse
+
+
+@kernel
+def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array]:
+    """Unit rays (N, 3) through normalised points (N, 2), and their derivatives (N, 3, M).
+
+    `by_pixel` (N, 2, M): derivatives of the points by the variables of the result's last axis.
+    """
+    n, variables = normalized.shape[0], by_pixel.shape[2]
+    rays, jacobian = np.empty((n, 3)), np.empty((n, 3, variables))
+    for i in range(n):
+        x, y = normalized[i, 0], normalized[i, 1]
+        scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
+        rays[i, 0], rays[i, 1], rays[i, 2] = x * scale, y * scale, scale
+        for k in range(variables):
+            # m = n / |n| with n = (x, y, 1): dm = (dn - m (m . dn)) / |n|.
+            dx, dy = by_pixel[i, 0, k], by_pixel[i, 1, k]
+            along = rays[i, 0] * dx + rays[i, 1] * dy
+            jacobian[i, 0, k] = (dx - rays[i, 0] * along) * scale
+            jacobian[i, 1, k] = (dy - rays[i, 1] * along) * scale
+            jacobian[i, 2, k] = -rays[i, 2] * along * scale
+    return rays, jacobian
+
+
+@kernel
+def project_rotating(
+    rays: Array,
+    rows: Array,
+    rotations: Array,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    lens: Lens,
+) -> Array:
+    """`RollingShutterCamera.project_rotating` with `intrinsics` fx, fy, cx, cy.
+
+    Row v images a ray if the orientation at the time of row v projects the ray into row v: a root
+    of ``projected_row(v) - v``, found by the secant method. Rotations are linear between their
+    rows, and beyond.
+    """
+    settled = 0.01  # largest distance of the assumed row from the projected one [px]
+    most_rounds = 12
+    fx, fy, cx, cy = intrinsics
+    out, rotated = np.empty((len(rays), 2)), np.empty(3)
+    profile, values = np.empty(_PROFILE), np.empty(6)
+    per_row = (len(rotations) - 1) / max(height - 1.0, 1.0)
+    for n in range(len(rays)):
+        row, before, ahead, slope = rows[n], rows[n], 0.0, 0.0
+        u = v = math.nan
+        for step in range(most_rounds):
+            place = row * per_row
+            i = int(min(max(place, 0.0), len(rotations) - 2.0))
+            share = place - i
+            for j in range(3):
+                first, second = dot(rotations[i, j], rays[n]), dot(rotations[i + 1, j], rays[n])
+                rotated[j] = first + share * (second - first)
+            if not rotated[2] > _NEAREST:
+                u = v = math.nan
+                break
+            x, y = rotated[0] / rotated[2], rotated[1] / rotated[2]
+            distort(x, y, lens, profile, values)
+            u, v = cx + fx * values[0], cy + fy * values[1]
+            if abs(v - row) < settled:
+                break
+            if step == most_rounds - 1:
+                u = v = math.nan
+            # Derivative of the projected row by the assumed row.
+            if step > 0 and row != before:
+                slope = (v - ahead) / (row - before)
+            if not abs(slope) < 0.9:
+                slope = 0.0
+            before, ahead = row, v
+            row += (v - row) / (1.0 - slope)
+        out[n, 0], out[n, 1] = u, v
+    return out
+
+
+# -- Derivatives by the lens ----------------------------------------------------------------------
+
+
+@kernel
+def _bends(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
+    """Write the second derivatives of D by (x, y) into `out` (2, 2, 2), component first."""
+    slope, bend = profile[1], profile[2]
+    p1, p2 = lens.sideways[0], lens.sideways[1]
+    s1, s2, s3, s4 = lens.sideways[2], lens.sideways[3], lens.sideways[4], lens.sideways[5]
+    r2 = x * x + y * y
+    xxx = x * (3.0 * slope + bend * x * x)
+    xxy = y * (slope + bend * x * x)
+    xyy = x * (slope + bend * y * y)
+    yyy = y * (3.0 * slope + bend * y * y)
+    out[0, 0, 0] = xxx + 6.0 * p2 + 2.0 * s1 + s2 * (4.0 * r2 + 8.0 * x * x)
+    out[0, 0, 1] = out[0, 1, 0] = xxy + 2.0 * p1 + 8.0 * s2 * x * y
+    out[0, 1, 1] = xyy + 2.0 * p2 + 2.0 * s1 + s2 * (4.0 * r2 + 8.0 * y * y)
+    out[1, 0, 0] = xxy + 2.0 * p1 + 2.0 * s3 + s4 * (4.0 * r2 + 8.0 * x * x)
+    out[1, 0, 1] = out[1, 1, 0] = xyy + 2.0 * p2 + 8.0 * s4 * x * y
+    out[1, 1, 1] = yyy + 6.0 * p1 + 2.0 * s3 + s4 * (4.0 * r2 + 8.0 * y * y)
+
+
+@kernel
+def _pull(x: float, y: float, focal: tuple[float, float], profile: Array, out: Array) -> None:
+    """Write ``dd/dq - dD/dq`` by each value q of the lens into the rows of `out` (7, 2).
+
+    `out` has the order of `LENS_ENTRIES`, and holds the distorted point in its first row.
+    """
+    out[0, 0], out[0, 1] = -out[0, 0], -out[0, 1]
+    out[1, 0], out[1, 1] = 0.0, out[0, 1]
+    for m in range(_N_RADIAL):
+        gain = profile[3 + 2 * m]
+        out[_DISTORTION + m, 0], out[_DISTORTION + m, 1] = -gain * x, -gain * y
+    out[N_LENS - 2, 0], out[N_LENS - 2, 1] = -1.0 / focal[0], 0.0
+    out[N_LENS - 1, 0], out[N_LENS - 1, 1] = 0.0, -1.0 / focal[1]
+
+
+@kernel
+def _turn(
+    x: float, y: float, q: int, moved: Array, profile: Array, bends: Array, out: Array
+) -> None:
+    """Write dJ/dq into `out` (2, 2): through the point that moves, and through the coefficient.
+
+    `moved` (2,) is dn/dq, and `bends` (2, 2, 2) is as of `_bends`.
+    """
+    for c in range(2):
+        for j in range(2):
+            out[c, j] = bends[c, j, 0] * moved[0] + bends[c, j, 1] * moved[1]
+    m = q - _DISTORTION
+    if 0 <= m < _N_RADIAL:
+        gain, slope = profile[3 + 2 * m], profile[4 + 2 * m]
+        out[0, 0] += gain + slope * x * x
+        out[0, 1] += slope * x * y
+        out[1, 0] += slope * x * y
+        out[1, 1] += gain + slope * y * y
+
+
+@kernel
+def points_by_lens(
+    points: Array, by_distorted: Array, focal: tuple[float, float], lens: Lens
+) -> ByLens:
+    """Derivatives of normalised points by the pixel and by the lens.
+
+    `points` (N, 2) are undistorted, `by_distorted` (N, 2, 2) are their derivatives A by the
+    distorted points d, both as of `undistort_points`; `focal` is (fx, fy) [px]. With J = dD/dn,
+    the equation ``D(n; k) = d`` holds for all pixels and lenses, so by a value q of the lens
+
+        dn/dq = A (dd/dq - dD/dq)          d2n/(du dq) = -A (dJ/dq) dn/du + A (d2d / (du dq))
+    """
+    n = points.shape[0]
+    by_pixel, by_lens = np.empty((n, 2, 2)), np.empty((n, 2, N_LENS))
+    by_both = np.empty((n, 2, 2, N_LENS))
+    profile, values, bends = np.empty(_PROFILE), np.empty(6), np.empty((2, 2, 2))
+    pull, moved, turn = np.empty((N_LENS, 2)), np.empty(2), np.empty((2, 2))
+    for i in range(n):
+        x, y, A, P = points[i, 0], points[i, 1], by_distorted[i], by_pixel[i]
+        distort(x, y, lens, profile, values)
+        _bends(x, y, lens, profile, bends)
+        for c in range(2):
+            P[c, 0], P[c, 1] = A[c, 0] / focal[0], A[c, 1] / focal[1]
+        pull[0, 0], pull[0, 1] = values[0], values[1]
+        _pull(x, y, focal, profile, pull)
+        for q in range(N_LENS):
+            for c in range(2):
+                moved[c] = A[c, 0] * pull[q, 0] + A[c, 1] * pull[q, 1]
+                by_lens[i, c, q] = moved[c]
+            _turn(x, y, q, moved, profile, bends, turn)
+            for j in range(2):
+                first = turn[0, 0] * P[0, j] + turn[0, 1] * P[1, j]
+                second = turn[1, 0] * P[0, j] + turn[1, 1] * P[1, j]
+                # A longer focal length makes the step of a pixel smaller: d2d / (du dq).
+                shrink = 1.0 if q == 0 or (q == 1 and j == 1) else 0.0
+                for c in range(2):
+                    by_both[i, c, j, q] = -(A[c, 0] * first + A[c, 1] * second) - shrink * P[c, j]
+    return ByLens(points, by_pixel, by_lens, by_both)
+
+
+@kernel
+def _dot(m: Array, n: Array) -> float:
+    """Product of the first two components: the change of a normalised point has no third one."""
+    return m[0] * n[0] + m[1] * n[1]
+
+
+@kernel
+def rays_by_lens(points: ByLens) -> ByLens:
+    """Unit rays and their derivatives from normalised points and theirs.
+
+    With ``m = n / |n|`` and ``h = 1 / |n|``: ``dm = h (dn - m (m . dn))``, and once more by q
+
+        d2m = h (d2n - m (m . d2n) - m_q (m . dn) - m (m_q . dn)) - h (m . dn_q) dm
+    """
+    rays, by_pixel = rays_with_jacobian(points.values, points.by_pixel)
+    _, by_lens = rays_with_jacobian(points.values, points.by_lens)
+    n = rays.shape[0]
+    by_both = np.empty((n, 3, 2, N_LENS))
+    for i in range(n):
+        scale = rays[i, 2]
+        for q in range(N_LENS):
+            growth = _dot(rays[i], points.by_lens[i, :, q])
+            for j in range(2):
+                step, both = points.by_pixel[i, :, j], points.by_pixel_by_lens[i, :, j, q]
+                along, along_both = _dot(rays[i], step), _dot(rays[i], both)
+                turned = _dot(by_lens[i, :, q], step)
+                for c in range(3):
+                    across = both[c] if c < 2 else 0.0
+                    across -= rays[i, c] * (along_both + turned) + by_lens[i, c, q] * along
+                    by_both[i, c, j, q] = scale * (across - growth * by_pixel[i, c, j])
+    return ByLens(rays, by_pixel, by_lens, by_both)
