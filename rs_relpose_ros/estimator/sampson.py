@@ -1,16 +1,11 @@
-"""The rolling-shutter Sampson error in pixels, its exact Jacobian, depths, inliers and noise.
+"""Residuals of a two-view state with their exact Jacobian, depths of its matches, and inliers.
 
-Constraint (docs/conventions.md), with ``b = t - tau_1 d_1 + tau_2 d_2`` and ``h = R f_2``::
+The residual of a match is that of `core.epipolar`, with ``b = t - tau_1 d_1 + tau_2 d_2`` and
+``h = R f_2`` (docs/conventions.md).
 
-    e = (f_1 x h) . b = 0
-    r = e / sqrt(sum_k q_k^2),   q_k = de / d(pixel coordinate k)          [px]
-
-Every scalar above is a triple product ``b . (p x h)``: of the ray f_1 or its derivative a by a
-pixel coordinate, with h or R times the derivative of f_2. Derivatives by the pixel include the
-distortion and the rotation of the camera from row to row: the error is in raw pixels.
-
-An observation row (20 floats) holds, for one match,
-``f_1, df_1/du, df_1/dv, f_2, df_2/du, df_2/dv, tau_1, tau_2``.
+A row of `observations` has 20 numbers for one match: the vectors f_1, df_1/du, df_1/dv, f_2,
+df_2/du and df_2/dv, each derotated to the middle row of its frame, and the row times tau_1 and
+tau_2.
 
 Matches are evaluated in blocks with the values of one quantity contiguous in memory, which the
 compiler vectorises. For that it must know the strides, hence the arrays of fixed shape and the
@@ -22,59 +17,104 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.core.epipolar import by_motion, residual, View
 from rs_relpose_ros.core.losses import Flags
 from rs_relpose_ros.core.triangulate import depths
-from rs_relpose_ros.estimator.priors import PARAMETERS, TwoViewState
+from rs_relpose_ros.estimator.priors import (
+    D1,
+    D2,
+    DW1,
+    DW2,
+    PARAMETERS,
+    TANGENT,
+    THETA,
+    TwoViewState,
+)
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64
+# First numbers of an observation: the vectors of both views, and the two row times. A block has
+# the root of the weight behind them.
+VIEW_1 = 0
+VIEW_2 = 9
+TIMES = 18
+OBSERVATION = 20
+ROOT = OBSERVATION
+
+
+class Motion(NamedTuple):
+    """A two-view state as polynomials in the row times."""
+
+    baseline: Array  # (3, 3) coefficients of b in 1, tau_1 and tau_2, one per row
+    rotation_1: Array  # (3, 3, 3) coefficients of the first rays' rotation in 1, tau_1, tau_1^2
+    rotation_2: Array  # (3, 3, 3) coefficients of the second rays' rotation in 1, tau_2, tau_2^2
 
 
 @inlined_kernel
-def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-@inlined_kernel
-def _coefficients(state: TwoViewState) -> tuple[Array, Array, Array]:
-    """Of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2 (3, 3), and `_rotation_series`."""
-    b = np.empty((3, 3))
+def _motion(state: TwoViewState) -> Motion:
+    """Expand ``t - tau_1 d_1 + tau_2 d_2``, ``Exp(tau_1 dw_1)`` and ``Exp(tau_2 dw_2) R``."""
+    baseline = np.empty((3, 3))
     for k in range(3):
-        b[0, k], b[1, k], b[2, k] = state.t[k], -state.d1[k], state.d2[k]
-    return b, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
+        baseline[0, k], baseline[1, k], baseline[2, k] = state.t[k], -state.d1[k], state.d2[k]
+    return Motion(
+        baseline, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
+    )
 
 
 @inlined_kernel
 def _rotation_series(rate: Array, R: Array) -> Array:
-    """Coefficients (3, 3, 3) of ``Exp(w tau) R`` in 1, tau, tau^2: w is a gyro correction."""
-    out = np.empty((3, 3, 3))
-    for j in range(3):
-        out[0, 0, j], out[0, 1, j], out[0, 2, j] = R[0, j], R[1, j], R[2, j]
-        for k in range(1, 3):
-            x, y, z = _cross(
-                rate[0], rate[1], rate[2], out[k - 1, 0, j], out[k - 1, 1, j], out[k - 1, 2, j]
-            )
-            out[k, 0, j], out[k, 1, j], out[k, 2, j] = x / k, y / k, z / k
-    return out
+    """Coefficients (3, 3, 3) of ``Exp(tau w) R`` in 1, tau, tau^2.
+
+    The rate w is a correction of the gyro, so small that the next coefficient is below rounding.
+    """
+    series = np.empty((3, 3, 3))
+    so3.copy_matrix(R, series[0])
+    for k in (1, 2):
+        for j in range(3):
+            column = so3.cross(rate, series[k - 1, :, j])
+            for i in range(3):
+                series[k, i, j] = column[i] / k
+    return series
 
 
 @inlined_kernel
-def _rotated(series, tau, x, y, z):  # type: ignore[no-untyped-def]
-    """A vector times the rotation of `_rotation_series` at tau."""
-    s = tau * tau
+def _row_at(series, i, tau):  # type: ignore[no-untyped-def]
+    """Row i of the rotation of `_rotation_series` at tau."""
     return (
-        (series[0, 0, 0] + tau * series[1, 0, 0] + s * series[2, 0, 0]) * x
-        + (series[0, 0, 1] + tau * series[1, 0, 1] + s * series[2, 0, 1]) * y
-        + (series[0, 0, 2] + tau * series[1, 0, 2] + s * series[2, 0, 2]) * z,
-        (series[0, 1, 0] + tau * series[1, 1, 0] + s * series[2, 1, 0]) * x
-        + (series[0, 1, 1] + tau * series[1, 1, 1] + s * series[2, 1, 1]) * y
-        + (series[0, 1, 2] + tau * series[1, 1, 2] + s * series[2, 1, 2]) * z,
-        (series[0, 2, 0] + tau * series[1, 2, 0] + s * series[2, 2, 0]) * x
-        + (series[0, 2, 1] + tau * series[1, 2, 1] + s * series[2, 2, 1]) * y
-        + (series[0, 2, 2] + tau * series[1, 2, 2] + s * series[2, 2, 2]) * z,
+        series[0, i, 0] + tau * (series[1, i, 0] + tau * series[2, i, 0]),
+        series[0, i, 1] + tau * (series[1, i, 1] + tau * series[2, i, 1]),
+        series[0, i, 2] + tau * (series[1, i, 2] + tau * series[2, i, 2]),
     )
+
+
+@inlined_kernel
+def _view_at(block, i, first, series, tau):  # type: ignore[no-untyped-def]
+    """Rotated ray of match i and its derivatives; its values begin in row `first` of the block."""
+    row_x, row_y, row_z = _row_at(series, 0, tau), _row_at(series, 1, tau), _row_at(series, 2, tau)
+    ray = (block[first, i], block[first + 1, i], block[first + 2, i])
+    by_u = (block[first + 3, i], block[first + 4, i], block[first + 5, i])
+    by_v = (block[first + 6, i], block[first + 7, i], block[first + 8, i])
+    return View(
+        (so3.dot(row_x, ray), so3.dot(row_y, ray), so3.dot(row_z, ray)),
+        (so3.dot(row_x, by_u), so3.dot(row_y, by_u), so3.dot(row_z, by_u)),
+        (so3.dot(row_x, by_v), so3.dot(row_y, by_v), so3.dot(row_z, by_v)),
+    )
+
+
+@inlined_kernel
+def _match(block, i, motion):  # type: ignore[no-untyped-def]
+    """Both views of match i of a block, and the baseline between its rows."""
+    tau1, tau2, b = block[TIMES, i], block[TIMES + 1, i], motion.baseline
+    baseline = (
+        b[0, 0] + tau1 * b[1, 0] + tau2 * b[2, 0],
+        b[0, 1] + tau1 * b[1, 1] + tau2 * b[2, 1],
+        b[0, 2] + tau1 * b[1, 2] + tau2 * b[2, 2],
+    )
+    first = _view_at(block, i, VIEW_1, motion.rotation_1, tau1)
+    second = _view_at(block, i, VIEW_2, motion.rotation_2, tau2)
+    return first, second, baseline
 
 
 @kernel
@@ -99,93 +139,47 @@ def _gather(observations: Array, weights: Array, first: int, block: Array) -> tu
 
 
 @inlined_kernel
-def _residual(o, i, baselines, series1, series2):  # type: ignore[no-untyped-def]
-    """Residual [px] of column i of a block, and the vectors that its derivative needs.
-
-    They are b, f_1, h, p', h', where ``dr`` is the sum of the variations of the triple products
-    b.(p' x h) and b.(f_1 x h').
-    """
-    tau1, tau2 = o[18, i], o[19, i]
-    bx = baselines[0, 0] + tau1 * baselines[1, 0] + tau2 * baselines[2, 0]
-    by = baselines[0, 1] + tau1 * baselines[1, 1] + tau2 * baselines[2, 1]
-    bz = baselines[0, 2] + tau1 * baselines[1, 2] + tau2 * baselines[2, 2]
-    fx, fy, fz = _rotated(series1, tau1, o[0, i], o[1, i], o[2, i])
-    ux, uy, uz = _rotated(series1, tau1, o[3, i], o[4, i], o[5, i])
-    vx, vy, vz = _rotated(series1, tau1, o[6, i], o[7, i], o[8, i])
-    hx, hy, hz = _rotated(series2, tau2, o[9, i], o[10, i], o[11, i])
-    hux, huy, huz = _rotated(series2, tau2, o[12, i], o[13, i], o[14, i])
-    hvx, hvy, hvz = _rotated(series2, tau2, o[15, i], o[16, i], o[17, i])
-    # h x b and b x f_1: the gradients of e by f_1 and by h.
-    gx, gy, gz = _cross(hx, hy, hz, bx, by, bz)
-    kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
-    e = gx * fx + gy * fy + gz * fz
-    q1 = gx * ux + gy * uy + gz * uz
-    q2 = gx * vx + gy * vy + gz * vz
-    q3 = kx * hux + ky * huy + kz * huz
-    q4 = kx * hvx + ky * hvy + kz * hvz
-    # Rays on the epipole have no gradient; the floor is far below any real one (1/px).
-    c0 = 1.0 / math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4 + 1e-30)
-    r = e * c0
-    c = -r * c0 * c0
-    c1, c2, c3, c4 = c * q1, c * q2, c * q3, c * q4
-    return (
-        r,
-        (bx, by, bz),
-        (fx, fy, fz),
-        (hx, hy, hz),
-        (c0 * fx + c1 * ux + c2 * vx, c0 * fy + c1 * uy + c2 * vy, c0 * fz + c1 * uz + c2 * vz),
-        (c3 * hux + c4 * hvx, c3 * huy + c4 * hvy, c3 * huz + c4 * hvz),
-    )
+def _write(rows, first, i, values):  # type: ignore[no-untyped-def]
+    """Write a vector into column i of `rows`, from row `first` on."""
+    rows[first, i], rows[first + 1, i], rows[first + 2, i] = values
 
 
 @inlined_kernel
-def _linearise(o, baselines, series1, series2, basis, rows):  # type: ignore[no-untyped-def]
+def _linearise(block, motion, basis, rows):  # type: ignore[no-untyped-def]
     """Derivatives of a block in `rows` (18, BLOCK), residuals last, times the weights' roots."""
     for i in range(BLOCK):
-        r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz), (px, py, pz), (jx, jy, jz) = _residual(
-            o, i, baselines, series1, series2
-        )
-        # by b: p' x h + f_1 x h'
-        nx, ny, nz = _cross(px, py, pz, hx, hy, hz)
-        mx, my, mz = _cross(fx, fy, fz, jx, jy, jz)
-        nx, ny, nz = nx + mx, ny + my, nz + mz
-        # by a rotation of the second rays: h x (b x p') + h' x (b x f_1)
-        sx, sy, sz = _cross(bx, by, bz, px, py, pz)
-        rx, ry, rz = _cross(hx, hy, hz, sx, sy, sz)
-        kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
-        mx, my, mz = _cross(jx, jy, jz, kx, ky, kz)
-        rx, ry, rz = rx + mx, ry + my, rz + mz
-        # by a rotation of the first rays: that of all three vectors, b too, changes nothing
-        mx, my, mz = _cross(bx, by, bz, nx, ny, nz)
-        wx, wy, wz = -rx - mx, -ry - my, -rz - mz
-        # Each entry of a row is linear in one of n, r and w, or is the residual.
-        root = o[20, i]
-        r, rx, ry, rz = root * r, root * rx, root * ry, root * rz
-        nx, ny, nz, wx, wy, wz = root * nx, root * ny, root * nz, root * wx, root * wy, root * wz
-        tau1, tau2 = o[18, i], o[19, i]
-        rows[0, i], rows[1, i], rows[2, i] = rx, ry, rz
-        rows[3, i] = nx * basis[0, 0] + ny * basis[1, 0] + nz * basis[2, 0]
-        rows[4, i] = nx * basis[0, 1] + ny * basis[1, 1] + nz * basis[2, 1]
-        rows[5, i], rows[6, i], rows[7, i] = -tau1 * nx, -tau1 * ny, -tau1 * nz
-        rows[8, i], rows[9, i], rows[10, i] = tau2 * nx, tau2 * ny, tau2 * nz
-        rows[11, i], rows[12, i], rows[13, i] = tau1 * wx, tau1 * wy, tau1 * wz
-        rows[14, i], rows[15, i], rows[16, i] = tau2 * rx, tau2 * ry, tau2 * rz
-        rows[17, i] = r
+        first, second, baseline = _match(block, i, motion)
+        at = residual(first, second, baseline)
+        by_baseline, by_rotation_1, by_rotation_2 = by_motion(first, second, baseline, at)
+        root, tau1, tau2 = block[ROOT, i], block[TIMES, i], block[TIMES + 1, i]
+        by_baseline = so3.scale(root, by_baseline)
+        by_rotation_1 = so3.scale(root, by_rotation_1)
+        by_rotation_2 = so3.scale(root, by_rotation_2)
+        _write(rows, THETA, i, by_rotation_2)
+        for k in range(2):
+            column = (basis[0, k], basis[1, k], basis[2, k])
+            rows[TANGENT + k, i] = so3.dot(by_baseline, column)
+        _write(rows, D1, i, so3.scale(-tau1, by_baseline))
+        _write(rows, D2, i, so3.scale(tau2, by_baseline))
+        _write(rows, DW1, i, so3.scale(tau1, by_rotation_1))
+        _write(rows, DW2, i, so3.scale(tau2, by_rotation_2))
+        rows[PARAMETERS, i] = root * at.value
 
 
 @kernel
 def residuals(observations: Array, state: TwoViewState) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
     n = observations.shape[0]
-    baselines, series1, series2 = _coefficients(state)
-    block, errors = np.empty((21, BLOCK)), np.empty(BLOCK)
+    motion = _motion(state)
+    block, errors = np.empty((OBSERVATION + 1, BLOCK)), np.empty(BLOCK)
     everything = np.ones(n)
     out = np.empty(n)
     first = 0
     while first < n:
         following, count = _gather(observations, everything, first, block)
         for i in range(BLOCK):
-            errors[i] = _residual(block, i, baselines, series1, series2)[0]
+            first_view, second_view, baseline = _match(block, i, motion)
+            errors[i] = residual(first_view, second_view, baseline).value
         so3.copy_vector(errors[:count], out[first:])
         first = following
     return out
@@ -195,15 +189,15 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
 def jacobian(observations: Array, state: TwoViewState) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
     n = observations.shape[0]
-    baselines, series1, series2 = _coefficients(state)
+    motion = _motion(state)
     basis = so3.tangent_basis(state.t)
-    block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    block, rows = np.empty((OBSERVATION + 1, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     everything = np.ones(n)
     out = np.empty((n, PARAMETERS))
     first = 0
     while first < n:
         following, count = _gather(observations, everything, first, block)
-        _linearise(block, baselines, series1, series2, basis, rows)
+        _linearise(block, motion, basis, rows)
         for i in range(count):
             for j in range(PARAMETERS):
                 out[first + i, j] = rows[j, i]
@@ -216,9 +210,9 @@ def normal_equations(
     observations: Array, weights: Array, state: TwoViewState
 ) -> tuple[Array, Array, float]:
     """``J^T W J`` (17, 17), ``J^T W r`` (17,) and ``r^T W r`` with the weights (N,) of matches."""
-    baselines, series1, series2 = _coefficients(state)
+    motion = _motion(state)
     basis = so3.tangent_basis(state.t)
-    block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    block, rows = np.empty((OBSERVATION + 1, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     # The residual as the last column of J: one product contains all three results. By BLAS, with
     # a fixed order of its sums: a block is too small for threads.
     gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
@@ -226,7 +220,7 @@ def normal_equations(
     first = 0
     while first < observations.shape[0]:
         first, _ = _gather(observations, weights, first, block)
-        _linearise(block, baselines, series1, series2, basis, rows)
+        _linearise(block, motion, basis, rows)
         np.dot(rows, rows.T, product)
         gram += product
     hessian = gram[:PARAMETERS, :PARAMETERS].copy()

@@ -31,6 +31,18 @@ def cross(a: Vector | Array, b: Vector | Array) -> Vector:
 
 
 @small_kernel
+def add(a: Vector | Array, b: Vector | Array) -> Vector:
+    """``a + b``."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@small_kernel
+def scale(factor: float, v: Vector | Array) -> Vector:
+    """``factor v``."""
+    return (factor * v[0], factor * v[1], factor * v[2])
+
+
+@small_kernel
 def norm(v: Vector | Array) -> float:
     """``|v|``; for vectors whose squares neither overflow nor vanish."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

@@ -1,0 +1,117 @@
+"""The measurement core: residual of a match, depths, losses, least squares."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.core import epipolar, losses, triangulate
+
+
+def random_views(rng, n=40):
+    """Return views (n, 2, 3, 3) of matches that are not far from their epipolar lines, and b."""
+    views = rng.normal(size=(n, 2, 3, 3)) * 0.3
+    views[:, :, 0, 2] += 1.0
+    views[:, :, 1:] /= 500.0
+    return views, rng.normal(size=(n, 3))
+
+
+def by_differences(function, size, step=1e-6):
+    """Return the derivative (N, size) of residuals by central differences."""
+    columns = [
+        (function(step * unit) - function(-step * unit)) / (2 * step) for unit in np.eye(size)
+    ]
+    return np.transpose(columns)
+
+
+def test_residual_of_a_match_is_the_constraint_over_its_gradient_by_pixels():
+    views, baselines = random_views(np.random.default_rng(1))
+
+    def constraint(pixels):  # (N, 4) steps of the two pixels
+        f, h = (
+            views[:, k, 0] + np.einsum('nij,ni->nj', views[:, k, 1:], pixels[:, 2 * k : 2 * k + 2])
+            for k in range(2)
+        )
+        return (np.cross(f, h) * baselines).sum(axis=1)
+
+    still = np.zeros((len(views), 4))
+    gradient = by_differences(
+        lambda step: constraint(still + step), 4, step=1e-2
+    )  # linear in each
+    expected = constraint(still) / np.linalg.norm(gradient, axis=1)
+    found = epipolar.derivatives(views, baselines).residuals
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_derivatives_of_a_match_equal_finite_differences():
+    views, baselines = random_views(np.random.default_rng(2))
+    found = epipolar.derivatives(views, baselines)
+
+    def moved(step):
+        return epipolar.derivatives(views, baselines + step).residuals
+
+    def check(exact, function, step):
+        numeric = by_differences(function, 3, step)
+        np.testing.assert_allclose(exact, numeric, atol=1e-6 * np.abs(numeric).max())
+
+    check(found.by_baseline, moved, 1e-6)
+    for image in range(2):
+
+        def turned(step, image=image):
+            changed = views.copy()
+            changed[:, image] = views[:, image] @ Rotation.from_rotvec(step).as_matrix().T
+            return epipolar.derivatives(changed, baselines).residuals
+
+        check(found.by_rotation[:, image], turned, 1e-6)
+        for vector in range(3):
+
+            def shifted(step, image=image, vector=vector):
+                changed = views.copy()
+                changed[:, image, vector] += step
+                return epipolar.derivatives(changed, baselines).residuals
+
+            check(found.by_rays[:, image, vector], shifted, 1e-6 if vector == 0 else 1e-8)
+
+
+def test_depths_are_those_of_points_in_front_of_and_behind_the_cameras():
+    rng = np.random.default_rng(3)
+    baselines, true_depths = rng.normal(size=(30, 3)), rng.uniform(2.0, 9.0, (30, 2))
+    true_depths[::3] *= -1.0
+    h = rng.normal(size=(30, 3))
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    f = baselines + true_depths[:, 1:] * h
+    lengths = np.linalg.norm(f, axis=1) * np.sign(true_depths[:, 0])
+    f /= lengths[:, None]
+    for k in range(30):
+        along_f, along_h, sine = triangulate.depths(f[k], h[k], baselines[k])
+        assert along_f == pytest.approx(lengths[k]) and along_h == pytest.approx(true_depths[k, 1])
+        assert sine == pytest.approx(np.linalg.norm(np.cross(f[k], h[k])))
+    l1, l2, usable = triangulate.depths_of_rays(f, h, baselines, 1e-9)
+    np.testing.assert_array_equal(usable, true_depths[:, 1] > 0.0)
+    np.testing.assert_allclose(l1[usable], lengths[usable])
+    np.testing.assert_allclose(l2[usable], true_depths[usable, 1])
+    assert np.isnan(triangulate.depths(f[0], f[0], baselines[0])[:2]).all()
+
+
+@pytest.mark.parametrize(
+    ('cost', 'weight'),
+    [
+        (losses.cauchy_cost, losses.cauchy_weight),
+        (losses.geman_mcclure_cost, losses.geman_mcclure_weight),
+    ],
+)
+def test_weight_of_a_loss_is_the_derivative_of_its_cost(cost, weight):
+    q = np.array([1e-3, 0.3, 1.0, 20.0])
+    numeric = (cost(q * (1 + 1e-6)) - cost(q * (1 - 1e-6))) / (2e-6 * q)
+    np.testing.assert_allclose(weight(q), numeric, rtol=1e-7)
+    assert cost(1e-9) == pytest.approx(1e-9)
+    assert weight(0.3) == pytest.approx(weight(q)[1])
+
+
+def test_robust_scale_is_the_sigma_of_normal_deviates_despite_outliers():
+    residuals = 0.7 * np.random.default_rng(4).normal(size=4000)
+    residuals[:200] = 1e6
+    assert losses.robust_scale(residuals, 0.0, 0.0) == pytest.approx(0.7, rel=0.1)
+    assert losses.robust_scale(residuals, 3.0, 0.0) == 3.0
+    assert losses.robust_scale(residuals[-8:], 0.0, 6.0) == pytest.approx(
+        2.0 * losses.robust_scale(residuals[-8:], 0.0, 0.0)
+    )
