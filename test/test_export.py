@@ -24,7 +24,7 @@ from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.odometry import export
-from rs_relpose_ros.odometry.landmarks import Tracks, triangulated
+from rs_relpose_ros.odometry.map_points import KeyframeObservations, triangulated
 from rs_relpose_ros.odometry.offline import aligned
 from rs_relpose_ros.offline.replay import read_truth
 
@@ -55,7 +55,9 @@ def rows(trajectory) -> RowTrajectory:
 def run(bundled_bag, trajectory, rows, tmp_path):
     """Export the bundled bag; exit code and folder. `changes`: of the rows."""
 
-    def export_it(*options: str, tracks: Tracks | None = None, **changes: Any) -> tuple[int, Path]:
+    def export_it(
+        *options: str, tracks: KeyframeObservations | None = None, **changes: Any
+    ) -> tuple[int, Path]:
         out, given = tmp_path / 'model', trajectory
         if tracks or changes:
             given = shutil.copytree(trajectory, tmp_path / 'other')
@@ -367,7 +369,7 @@ def test_frames_in_a_gap_are_left_out_and_listed(run, rows, caplog):
 
 
 def test_without_landmarks_images_are_exported(run, capsys):
-    code, out = run('--format', 'colmap', '--rate', '5', tracks=Tracks.merged([]))
+    code, out = run('--format', 'colmap', '--rate', '5', tracks=KeyframeObservations.merged([]))
     assert code == 0
     assert 'no points: no track' in capsys.readouterr().out
     assert report_of(out)['images'] > 20
@@ -399,7 +401,7 @@ def test_landmarks_are_gated(rows):
     pixels[4, :10] += 30.0  # a wrong match
     pixels[:, 10:20] += 15.0 * rng.standard_normal((6, 10, 2))  # no point at all
     ids = np.repeat(np.arange(40), 6)
-    tracks = Tracks(
+    tracks = KeyframeObservations(
         ids, np.tile(times, 40), np.tile(times, 40), pixels.transpose(1, 0, 2).reshape(-1, 2)
     )
     found = triangulated(tracks, rows, Sensor(camera, intrinsics, ImageClock(camera)), 100)
@@ -423,4 +425,4 @@ def test_ncore_without_its_package(run, monkeypatch, capsys):
 def test_a_damaged_table_of_tracks(tmp_path):
     (tmp_path / 'tracks.npz').write_bytes(b'no zip')
     with pytest.raises(InputError, match=r'tracks\.npz is damaged'):
-        Tracks.load(tmp_path / 'tracks.npz')
+        KeyframeObservations.load(tmp_path / 'tracks.npz')

@@ -371,16 +371,14 @@ def _export(args: argparse.Namespace) -> int:
         else:
             part.mkdir()
             with options.opened(args, read_parameters(args.params, args.set)) as opened:
-                report = export.export_into(
-                    part,
-                    *opened,
-                    trajectory,
+                choice = export.Choice(
                     args.format,
                     args.images,
                     args.rate,
                     args.points,
                     trajectory / IMAGES if args.link else None,
                 )
+                report = export.export_into(part, *opened, trajectory, choice)
             _print_report(args, report)
             if args.trajectory is None:
                 trajectory.rename(part / 'odometry')

@@ -23,8 +23,13 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
 from rs_relpose_ros.messages.incoming import Intake, sensor_messages
 from rs_relpose_ros.messages.outgoing import encode_pixels
 from rs_relpose_ros.odometry import formats
-from rs_relpose_ros.odometry.formats import Format, FORMATS, IMAGES, Model
-from rs_relpose_ros.odometry.landmarks import Landmarks, Tracks, TRACKS_FILE, triangulated
+from rs_relpose_ros.odometry.formats import Format, FORMATS, IMAGES, Model, rotated, rotated_back
+from rs_relpose_ros.odometry.map_points import (
+    KeyframeObservations,
+    MapPoints,
+    TRACKS_FILE,
+    triangulated,
+)
 from rs_relpose_ros.odometry.rows import ROWS_FILE, RowTrajectory
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reason
 from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, save_picture, written
@@ -35,12 +40,44 @@ from rs_relpose_ros.tracking.images import CompressedImage, Pixels
 
 Ints = NDArray[np.int64]
 
-RAW, UNROLLED, NO_IMAGES = IMAGE_CHOICES = ('raw', 'unrolled', 'none')
-REPORT_FILE, PICTURE = 'export.json', 'model.png'
-# Times within this belong to one image: tracked corrections may come a frame later.
+RAW = 'raw'
+UNROLLED = 'unrolled'
+NO_IMAGES = 'none'
+IMAGE_CHOICES = (RAW, UNROLLED, NO_IMAGES)
+REPORT_FILE = 'export.json'
+PICTURE = 'model.png'
+# Times that differ by less belong to one image: a correction of the offset or of the readout that
+# is tracked moves the time of a row a little from frame to frame. It must be shorter than half a
+# frame interval. [chosen: 0.1 to 5 ms would do: corrections are below 0.1 ms a frame]
 _SAME_NS = 1_000_000
-# Points of an export, at most.
+# Largest number of points of an export. More points make files that splatting tools read slowly;
+# the points whose depth is known best are kept. [chosen: 10,000 to 500,000 would do]
 MOST_POINTS = 50_000
+# Gray of a point until an image shows it.
+_UNKNOWN_GRAY = 128
+# Poses per span of the path in the picture. [chosen: enough for a smooth line]
+_DRAWN_POSES = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What an export contains."""
+
+    format_name: str  # key of `FORMATS`
+    images: str = ''  # of IMAGE_CHOICES; empty for the images that the format wants
+    rate: float = 0.0  # largest number of images a second [Hz]; 0 for the keyframes
+    most_points: int = MOST_POINTS
+    store: Path | None = None  # folder in which raw images are kept, to be linked
+
+    @property
+    def format(self) -> Format:
+        """The exporter."""
+        return FORMATS[self.format_name]
+
+    @property
+    def image_kind(self) -> str:
+        """Which images are written, of IMAGE_CHOICES."""
+        return self.images or self.format.images
 
 
 def export_into(
@@ -49,65 +86,36 @@ def export_into(
     topics: SensorTopics,
     parameters: Parameters,
     trajectory: Path,
-    to: str,
-    images: str = '',
-    rate: float = 0.0,
-    most_points: int = MOST_POINTS,
-    store: Path | None = None,
+    choice: Choice,
 ) -> dict[str, Any]:
     """Write a bag's images, cameras and points into an empty folder; content of export.json.
 
-    `trajectory`: folder of `rs_relpose odometry` with the same bag. `to`: the format. `images`
-    and `rate` (at most so many a second [Hz]): empty and 0 for the format's own and keyframes.
-    `store`: folder in which raw images are kept, to be linked. InputError if no image has a pose,
-    or none can be used.
+    `trajectory`: folder of `rs_relpose odometry` with the same bag. InputError if no image has a
+    pose, or none can be used.
     """
     rows = RowTrajectory.load(trajectory / ROWS_FILE)
-    tracks = Tracks.load(trajectory / TRACKS_FILE)
-    chosen = FORMATS[to]
-    kind = images or chosen.images
-    run = _Frames(folder, rows, tracks, parameters, kind, rate, most_points, store)
-    loop = FrameLoop(parameters, run.unroller, offline=True, colors=True)
-    intake = Intake(loop.sequencer, parameters)
-    for outcome in outcomes(loop, intake, sensor_messages(bag, topics)):
-        if isinstance(outcome, Frame):
-            run.add(outcome)
-        elif isinstance(outcome, MessageRefused):
-            if not run.views:
-                outcome.raise_without_intrinsics()
-        elif outcome.stamp_ns is not None:
-            run.leave_out(outcome.stamp_ns, unused_reason(outcome))
-    if not run.views:
-        reasons = Counter(one['reason'] for one in run.left_out)
-        reason = max(
-            reasons, key=reasons.__getitem__, default='none is a keyframe of the trajectory'
-        )
-        raise InputError(
-            f'no image of {bag.path} can be exported: {reason}. Is the trajectory '
-            'that of this bag?'
-        )
+    observations = KeyframeObservations.load(trajectory / TRACKS_FILE)
+    run = _Frames(folder, rows, observations, parameters, choice)
+    run.read(bag, topics)
     model = run.model()
-    exported = derotated(model, rows) if kind == UNROLLED else model
-    exported = replace(exported, camera=formats.fitted(exported.camera, chosen.radial))
-    reprojection, formula = _deviations(model, exported, rows, chosen)
-    chosen.write(exported, folder)
+    exported = derotated(model, rows) if choice.image_kind == UNROLLED else model
+    lens_camera = formats.fitted(exported.camera, choice.format.radial)
+    exported = replace(exported, camera=lens_camera)
+    reprojection, formula = _deviations(model, exported, rows, choice.format)
+    choice.format.write(exported, folder)
     _draw(model, rows, folder / PICTURE)
+    ends = rows.spans[:-1, 1].tolist()
+    begins = rows.spans[1:, 0].tolist()
     report = {
-        'format': to,
+        'format': choice.format_name,
         'images': len(model.names),
-        'image_kind': kind,
+        'image_kind': choice.image_kind,
         'points': len(model.points),
         'observations': len(model.pixels),
         'reprojection_px': reprojection,
         'formula_px': formula,
         'left_out': run.left_out,
-        'trajectory_gaps_ns': [
-            (end, begin)
-            for end, begin in zip(
-                rows.spans[:-1, 1].tolist(), rows.spans[1:, 0].tolist(), strict=True
-            )
-            if begin > end
-        ],
+        'trajectory_gaps_ns': [gap for gap in zip(ends, begins, strict=True) if gap[1] > gap[0]],
     }
     (folder / REPORT_FILE).write_text(json.dumps(report, indent=1) + '\n', encoding='utf-8')
     return report
@@ -128,21 +136,41 @@ class _Frames:
 
     folder: Path
     rows: RowTrajectory
-    tracks: Tracks
+    tracks: KeyframeObservations
     parameters: Parameters
-    kind: str  # of images
-    rate: float
-    most_points: int
-    store: Path | None
+    choice: Choice
     unroller: Unroller = field(default_factory=Unroller)
     views: list[_View] = field(default_factory=list)
     left_out: list[dict[str, Any]] = field(default_factory=list)  # stamps and reasons
-    next_ns: int = 0
+    next_ns: int = 0  # time of the next image, where a rate is chosen
     # From the first frame on.
     sensor: Sensor = field(init=False)
-    landmarks: Landmarks | None = None
+    points: MapPoints | None = None
     order: Ints = field(init=False)  # of the observations, by keyframes
     colors: NDArray[np.uint8] = field(init=False)
+
+    def read(self, bag: Bag, topics: SensorTopics) -> None:
+        """Go through a bag; InputError if no image can be exported."""
+        loop = FrameLoop(self.parameters, self.unroller, offline=True, colors=True)
+        intake = Intake(loop.sequencer, self.parameters)
+        for outcome in outcomes(loop, intake, sensor_messages(bag, topics)):
+            if isinstance(outcome, Frame):
+                self.add(outcome)
+            elif isinstance(outcome, MessageRefused):
+                if not self.views:
+                    outcome.raise_without_intrinsics()
+            elif outcome.stamp_ns is not None:
+                self.leave_out(outcome.stamp_ns, unused_reason(outcome))
+        if self.views:
+            return
+        reason = 'none is a keyframe of the trajectory'
+        reasons = Counter(one['reason'] for one in self.left_out)
+        if reasons:
+            reason = reasons.most_common(1)[0][0]
+        raise InputError(
+            f'no image of {bag.path} can be exported: {reason}. Is the trajectory '
+            'that of this bag?'
+        )
 
     def leave_out(self, stamp_ns: int, reason: str) -> None:
         """Count an image that is not exported."""
@@ -153,30 +181,20 @@ class _Frames:
         sensor = sensor_model(
             frame.intrinsics, self.parameters.sensor, self.unroller.applied.readout_time
         )
-        if self.landmarks is None:
-            self.landmarks = triangulated(self.tracks, self.rows, sensor, self.most_points)
-            self.colors = np.full((len(self.landmarks.positions), 3), 128, dtype=np.uint8)
-            self.order = np.argsort(self.landmarks.observations.keyframes_ns, kind='stable')
+        if self.points is None:
+            self.points = triangulated(self.tracks, self.rows, sensor, self.choice.most_points)
+            shape = len(self.points.positions), 3
+            self.colors = np.full(shape, _UNKNOWN_GRAY, dtype=np.uint8)
+            self.order = np.argsort(self.points.observations.keyframes_ns, kind='stable')
             self.sensor = sensor
         at_ns = frame.imu.reference_ns
-        found = self._observations(self.landmarks, at_ns)
-        if len(found):
-            u, v = np.rint(self.landmarks.observations.pixels[found]).astype(int).T
-            height, width = frame.image.shape[:2]
-            self.colors[self.landmarks.points[found]] = _rgb(
-                frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], frame.encoding
-            )
+        self._take_colors(frame, self.points, self._observations(self.points, at_ns))
         if not self._is_chosen(at_ns):
             return
         if frame.intrinsics != self.sensor.intrinsics:
             self.leave_out(frame.stamp_ns, 'it has other intrinsics')
             return
-        edges = sensor.intrinsics.to_sensor(
-            np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (frame.intrinsics.image_height - 1)
-        )
-        times = at_ns + np.rint(
-            NANOSECONDS * np.sort(sensor.camera.row_times(edges[:, 1]))
-        ).astype(np.int64)
+        times = at_ns + _row_delays(sensor, frame.intrinsics.image_height)
         if self.rows.covers(times).all():
             self.views.append(_View(self._write(frame), frame.stamp_ns, at_ns, times))
         else:
@@ -185,74 +203,98 @@ class _Frames:
                 'there is no pose: it is before, after or in a gap of the trajectory',
             )
 
+    def _take_colors(
+        self, frame: Frame[GlobalShutterFrame], points: MapPoints, observed: Ints
+    ) -> None:
+        """Give points the colours of the pixels where a frame shows them."""
+        if not len(observed):
+            return
+        u, v = np.rint(points.observations.pixels[observed]).astype(int).T
+        height, width = frame.image.shape[:2]
+        values = frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
+        self.colors[points.points[observed]] = _rgb(values, frame.encoding)
+
     def _is_chosen(self, at_ns: int) -> bool:
-        if not self.rate:
+        if not self.choice.rate:
             return bool((np.abs(self.tracks.keyframes_ns - at_ns) <= _SAME_NS).any())
         if at_ns < self.next_ns - _SAME_NS:
             return False
-        step = to_nanoseconds(1.0 / self.rate)
-        self.next_ns = (
-            max(self.next_ns + step, at_ns + step // 2) if self.next_ns else (at_ns + step)
-        )
+        step = to_nanoseconds(1.0 / self.choice.rate)
+        if self.next_ns:
+            # Images that come late do not bring the next ones forward.
+            self.next_ns = max(self.next_ns + step, at_ns + step // 2)
+        else:
+            self.next_ns = at_ns + step
         return True
 
-    def _observations(self, landmarks: Landmarks, at_ns: int) -> Ints:
-        """Indices of the landmarks' observations in an image."""
-        keyframes = landmarks.observations.keyframes_ns
-        first, last = np.searchsorted(
-            keyframes, [at_ns - _SAME_NS, at_ns + _SAME_NS + 1], sorter=self.order
-        )
+    def _observations(self, points: MapPoints, at_ns: int) -> Ints:
+        """Indices of the observations of points in an image."""
+        keyframes = points.observations.keyframes_ns
+        window = [at_ns - _SAME_NS, at_ns + _SAME_NS + 1]
+        first, last = np.searchsorted(keyframes, window, sorter=self.order)
         return self.order[first:last]
 
     def _write(self, frame: Frame[GlobalShutterFrame]) -> str:
         """Write an image if requested, and return its name."""
-        kind, encoded = self.kind, frame.encoded
+        kind, encoded = self.choice.image_kind, frame.encoded
         assert encoded is not None and frame.result is not None
         if isinstance(encoded, CompressedImage) and kind != UNROLLED:
-            suffix, data = ('png' if encoded.is_png else 'jpg'), encoded.data.tobytes()
+            suffix = 'png' if encoded.is_png else 'jpg'
+            data = encoded.data.tobytes()
         elif kind == NO_IMAGES:
             suffix, data = 'png', b''
-        else:  # lossless where the recording is
-            pixels = (
-                frame.result.image() if kind == UNROLLED else Pixels(frame.image, frame.encoding)
-            )
-            suffix, data = encode_pixels(
-                pixels, png=encoded.is_png or not isinstance(encoded, CompressedImage)
-            )
+        else:
+            pixels = Pixels(frame.image, frame.encoding)
+            if kind == UNROLLED:
+                pixels = frame.result.image()
+            # Lossless where the recording is.
+            png = encoded.is_png or not isinstance(encoded, CompressedImage)
+            suffix, data = encode_pixels(pixels, png=png)
         name = f'{frame.stamp_ns:019d}.{suffix.replace("jpeg", "jpg")}'
-        if kind != NO_IMAGES:
-            target = self.folder / IMAGES / name
-            target.parent.mkdir(exist_ok=True)
-            if self.store is None:
-                target.write_bytes(data)
-            else:
-                _link(self.store / name, target, data)
+        if kind == NO_IMAGES:
+            return name
+        target = self.folder / IMAGES / name
+        target.parent.mkdir(exist_ok=True)
+        if self.choice.store is None:
+            target.write_bytes(data)
+        else:
+            _link(self.choice.store / name, target, data)
         return name
 
     def model(self) -> Model:
         """The model of the raw images."""
-        views, landmarks = self.views, self.landmarks
-        assert landmarks is not None
+        views, points = self.views, self.points
+        assert points is not None
         times = np.array([view.times_ns for view in views])
         R, p = self.rows.pose(times)
-        parts = [self._observations(landmarks, view.reference_ns) for view in views]
+        velocities, rates = self.rows.velocity(times[:, formats.MIDDLE])
+        parts = [self._observations(points, view.reference_ns) for view in views]
         order = np.concatenate(parts).astype(np.int64)
         frames = np.repeat(np.arange(len(views)), [len(part) for part in parts])
         return Model(
-            _published(self.sensor),
-            self.parameters.sensor.exposure_time,
-            tuple(view.name for view in views),
-            np.array([view.stamp_ns for view in views]),
-            times,
-            R,
-            p,
-            *self.rows.velocity(times[:, formats.MIDDLE]),
-            landmarks.positions,
-            self.colors,
-            landmarks.errors,
-            np.column_stack([frames, landmarks.points[order]]),
-            landmarks.observations.pixels[order],
+            camera=_published(self.sensor),
+            exposure_time=self.parameters.sensor.exposure_time,
+            names=tuple(view.name for view in views),
+            stamps_ns=np.array([view.stamp_ns for view in views]),
+            times_ns=times,
+            R=R,
+            positions=p,
+            velocities=velocities,
+            rates=rates,
+            points=points.positions,
+            colors=self.colors,
+            errors=points.errors,
+            observed=np.column_stack([frames, points.points[order]]),
+            pixels=points.observations.pixels[order],
         )
+
+
+def _row_delays(sensor: Sensor, height: int) -> Ints:
+    """Delays (3,) [ns] of the first, the middle and the last row that are read of an image."""
+    edges = np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (height - 1)
+    rows = sensor.intrinsics.to_sensor(edges)[:, 1]
+    delays = np.sort(sensor.camera.row_times(rows))
+    return np.rint(NANOSECONDS * delays).astype(np.int64)
 
 
 def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
@@ -261,9 +303,8 @@ def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
         values = values // 257
     if values.ndim == 1:
         values = np.repeat(values[:, None], 3, axis=1)
-    return np.asarray(
-        values[:, :3] if encoding.startswith(('rgb', 'mono')) else values[:, 2::-1], dtype=np.uint8
-    )
+    channels = slice(0, 3) if encoding.startswith(('rgb', 'mono')) else slice(2, None, -1)
+    return np.asarray(values[:, channels], dtype=np.uint8)
 
 
 def _link(source: Path, target: Path, data: bytes) -> None:
@@ -301,8 +342,8 @@ def _published(sensor: Sensor) -> RollingShutterCamera:
 def _shown(model: Model, rows: RowTrajectory, k: Ints, pixels: Array) -> Array:
     """Pixels (N, 2) of derotated images of pixels of the frames k (N,)."""
     R, _ = rows.pose(model.times_of(k, pixels[:, 1]))
-    rays = np.einsum('nij,nj->ni', R, model.camera.unproject(pixels))
-    return model.camera.project(np.einsum('nji,nj->ni', model.R[k, formats.MIDDLE], rays))
+    in_world = rotated(R, model.camera.unproject(pixels))
+    return model.camera.project(rotated_back(model.R[k, formats.MIDDLE], in_world))
 
 
 def derotated(model: Model, rows: RowTrajectory) -> Model:
@@ -319,34 +360,35 @@ def derotated(model: Model, rows: RowTrajectory) -> Model:
 
 
 def _deviations(
-    model: Model,
-    exported: Model,
-    rows: RowTrajectory,
-    chosen: Format,
+    model: Model, exported: Model, rows: RowTrajectory, chosen: Format
 ) -> tuple[dict[str, float] | None, dict[str, float] | None]:
-    """Of observed pixels from points at the poses of their rows, and of the format from that.
+    """Distances in the images; None without points.
 
-    The latter by its own formula for the place of a point; None without points.
+    The first ones are those of the observed pixels from the points at the poses of their rows, the
+    second ones those of the points by the format's own formula from the points at these poses.
     """
     k, points = model.observed[:, 0], model.points[model.observed[:, 1]]
     if not len(k):
         return None, None
-    by_path = formats.projected(formats.path(rows), model, k, points, model.pixels[:, 1])
+    at_row = model.pixels[:, 1]
+    by_path = formats.projected(formats.path(rows), model, k, points, at_row)
+    by_formula = formats.projected(chosen.place, exported, k, points, at_row)
     shown = by_path if exported.rolls else _shown(model, rows, k, by_path)
-    return _spread(by_path - model.pixels), _spread(
-        formats.projected(chosen.place, exported, k, points, model.pixels[:, 1]) - shown
-    )
+    return _spread(by_path - model.pixels), _spread(by_formula - shown)
 
 
 def _spread(differences: Array) -> dict[str, float]:
-    """Of differences (N, 2) [px], of which those that are NaN do not count; most: 95 %."""
+    """Statistics of the lengths of finite differences (N, 2) [px]; `most` is that of 95 %."""
     lengths = np.linalg.norm(differences[np.isfinite(differences).all(axis=1)], axis=1)
-    values = (
-        [lengths.mean(), *np.percentile(lengths, [50.0, 95.0, 100.0])]
-        if len(lengths)
-        else ([math.nan] * 4)
-    )
-    return dict(zip(('mean', 'median', 'most', 'largest'), map(float, values), strict=True))
+    if not len(lengths):
+        return dict.fromkeys(('mean', 'median', 'most', 'largest'), math.nan)
+    median, most, largest = np.percentile(lengths, [50.0, 95.0, 100.0]).tolist()
+    return {
+        'mean': float(lengths.mean()),
+        'median': median,
+        'most': most,
+        'largest': largest,
+    }
 
 
 def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
@@ -354,33 +396,21 @@ def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
     picture = Figure(figsize=(8.0, 8.0), dpi=110, layout='constrained')
     axes = picture.subplots()
     axes.scatter(model.points[:, 0], model.points[:, 1], s=1.0, color='0.6', label='points')
-    for first, last in rows.spans:
-        _, p = rows.pose(first + np.linspace(0, last - first, 2000).astype(np.int64))
-        axes.plot(
-            p[:, 0],
-            p[:, 1],
-            color=BLUE,
-            lw=1.2,
-            label='path' if first == rows.spans[0, 0] else None,
-        )
+    for number, (first, last) in enumerate(rows.spans):
+        times = first + np.linspace(0, last - first, _DRAWN_POSES).astype(np.int64)
+        x, y, _ = rows.pose(times)[1].T
+        axes.plot(x, y, color=BLUE, lw=1.2, label=None if number else 'path')
     if len(rows.loops_ns):
         _, ends = rows.pose(rows.loops_ns)
         axes.plot(*ends[..., :2].transpose(2, 1, 0), color=GREEN, lw=0.8)
         axes.plot([], color=GREEN, lw=0.8, label=f'{len(ends)} loops')
-    middle = model.positions[:, formats.MIDDLE]
-    forward = model.R[:, formats.MIDDLE, :, 2]
-    axes.quiver(
-        middle[:, 0],
-        middle[:, 1],
-        forward[:, 0],
-        forward[:, 1],
-        color=ORANGE,
-        width=2e-3,
-        label='cameras',
-    )
+    middle = model.positions[:, formats.MIDDLE, :2]
+    forward = model.R[:, formats.MIDDLE, :2, 2]
+    axes.quiver(*middle.T, *forward.T, color=ORANGE, width=2e-3, label='cameras')
     if len(model.points):  # a few far ones would shrink the rest
         low, high = np.percentile(model.points[:, :2], [2.0, 98.0], axis=0)
-        low, high = np.minimum(low, middle[:, :2].min(0)), np.maximum(high, middle[:, :2].max(0))
+        low = np.minimum(low, middle.min(axis=0))
+        high = np.maximum(high, middle.max(axis=0))
         axes.set(xlim=(low[0] - 1.0, high[0] + 1.0), ylim=(low[1] - 1.0, high[1] + 1.0))
     axes.set_aspect('equal', 'box')
     axes.set(

@@ -22,11 +22,24 @@ from rs_relpose_ros.odometry.rows import RowTrajectory
 
 Ints = NDArray[np.int64]
 
-# Rows of `Model.R` and `Model.positions`.
-START, MIDDLE, END = range(3)
+# The rows of an image whose poses a model has: indices into axis 1 of `Model.R`.
+MODEL_ROWS = ('start', 'middle', 'end')
+START, MIDDLE, END = range(len(MODEL_ROWS))
 # From OpenGL's camera axes (x right, y up, z backward) to those of OpenCV.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# OpenCV counts pixels from the centre of the first one, all formats here from its corner.
+_HALF_PIXEL = 0.5
+# Folder of the images in an export.
 IMAGES = 'images'
+# Name of the camera in a sequence of NCore.
+CAMERA_ID = 'camera'
+# Rounds that find the row in which a point appears. A round divides the error of the row by the
+# ratio of the readout to the time in which the point crosses the image, at least about 10.
+# [chosen: the row is exact to float32 after 4 to 6 rounds; more only cost time]
+_ROW_ROUNDS = 6
+# Pixels of the grid, per axis, over which a lens is fitted. [chosen: any value in 20..100 samples
+# the smooth difference of two lenses densely]
+_FIT_GRID = 41
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,22 +69,39 @@ class Model:
     @property
     def poses(self) -> Array:
         """Matrices (F, 3, 4, 4) from the camera to the world."""
-        out = np.zeros((*self.R.shape[:2], 4, 4))
-        out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = self.R, self.positions, 1.0
-        return out
+        poses = np.zeros((*self.R.shape[:2], 4, 4))
+        poses[..., :3, :3] = self.R
+        poses[..., :3, 3] = self.positions
+        poses[..., 3, 3] = 1.0
+        return poses
 
     def times_of(self, k: Ints, rows: Array) -> Ints:
         """Times (N,) [ns] of rows of the frames k (N,), limited to those of the image."""
-        first = 0.0 if self.camera.readout_direction == 'down' else self.camera.height - 1.0
-        times = self.times_ns[k, START] + np.rint(
-            NANOSECONDS * self.camera.line_delay * (np.nan_to_num(rows) - first)
-        ).astype(np.int64)
-        return np.clip(times, self.times_ns[k, START], self.times_ns[k, END])
+        begin, _, end = self.times_ns[k].T
+        first_row = 0.0 if self.reads_down else self.camera.height - 1.0
+        delays = self.camera.line_delay * (np.nan_to_num(rows) - first_row)
+        times = begin + np.rint(NANOSECONDS * delays).astype(np.int64)
+        return np.clip(times, begin, end)
 
     @property
     def rolls(self) -> bool:
         """Whether the images have a rolling shutter."""
         return self.camera.readout_time > 0.0
+
+    @property
+    def reads_down(self) -> bool:
+        """Whether the top row is read first."""
+        return self.camera.readout_direction == 'down'
+
+
+def rotated(R: Array, vectors: Array) -> Array:
+    """``R_n v_n`` of matrices (N, 3, 3) and vectors (N, 3)."""
+    return np.einsum('nij,nj->ni', R, vectors)
+
+
+def rotated_back(R: Array, vectors: Array) -> Array:
+    """``R_n^T v_n`` of matrices (N, 3, 3) and vectors (N, 3)."""
+    return np.einsum('nji,nj->ni', R, vectors)
 
 
 # -- where a format has the camera at a row -------------------------------------------------------
@@ -83,53 +113,55 @@ Placement = Callable[[Model, Ints, Array, Array], Array]
 
 
 def _share(model: Model, rows: Array) -> Array:
-    """Share of the readout, 0 at the row that is read first."""
+    """Share of the readout (N,), 0 at the row that is read first."""
     share = rows / (model.camera.height - 1.0)
-    return share if model.camera.readout_direction == 'down' else 1.0 - share
+    return share if model.reads_down else 1.0 - share
 
 
-def _slerp(model: Model, k: Ints, share: Array) -> Rotation:
-    """Rotation from the camera to the world, at constant rate from start to end."""
+def _slerp_back(model: Model, k: Ints, share: Array, vectors: Array) -> Array:
+    """Rotate vectors (N, 3) to the camera, which turns at a constant rate from start to end."""
     first = Rotation.from_matrix(model.R[k, START])
-    turn = (first.inv() * Rotation.from_matrix(model.R[k, END])).as_rotvec()
-    return first * Rotation.from_rotvec(share[:, None] * turn)
+    last = Rotation.from_matrix(model.R[k, END])
+    turn = (first.inv() * last).as_rotvec()
+    at_share = first * Rotation.from_rotvec(share[:, None] * turn)
+    return np.asarray(at_share.inv().apply(vectors))
 
 
 def lerp_of_position(model: Model, k: Ints, points: Array, rows: Array) -> Array:
     """Slerp of the rotation, linear position of the camera in the world."""
     share = _share(model, rows)
-    start, end = model.positions[k, START], model.positions[k, END]
-    return np.asarray(
-        _slerp(model, k, share).inv().apply(points - start - share[:, None] * (end - start))
-    )
+    start = model.positions[k, START]
+    way = model.positions[k, END] - start
+    return _slerp_back(model, k, share, points - start - share[:, None] * way)
 
 
 def lerp_of_translation(model: Model, k: Ints, points: Array, rows: Array) -> Array:
     """Slerp of the rotation, linear translation from world to camera; the same in a whole row."""
     share = _share(model, np.floor(rows + 0.5))
-    start, end = (
-        -np.einsum('nji,nj->ni', model.R[k, i], model.positions[k, i]) for i in (START, END)
-    )
-    return np.asarray(
-        _slerp(model, k, share).inv().apply(points) + start + share[:, None] * (end - start)
-    )
+    start = -rotated_back(model.R[k, START], model.positions[k, START])
+    end = -rotated_back(model.R[k, END], model.positions[k, END])
+    turned = _slerp_back(model, k, share, points)
+    return np.asarray(turned + start + share[:, None] * (end - start))
 
 
 def middle(model: Model, k: Ints, points: Array, rows: Array) -> Array:
     """One pose per image."""
-    return np.einsum('nji,nj->ni', model.R[k, MIDDLE], points - model.positions[k, MIDDLE])
+    return rotated_back(model.R[k, MIDDLE], points - model.positions[k, MIDDLE])
 
 
 def velocity_of_pixel(model: Model, k: Ints, points: Array, rows: Array) -> Array:
     """Constant velocity in the undistorted image, whose rows have the times of the original's."""
-    camera, local = model.camera, middle(model, k, points, rows)
-    z = local[:, 2:]
+    camera = model.camera
+    local = middle(model, k, points, rows)
+    depth = local[:, 2:]
+    plane = local[:, :2] / depth
+    # Velocity of the point in the axes of the camera, and in the plane at depth 1.
     flow = -(model.velocities[k] + np.cross(model.rates[k], local))
-    plane, speed = local[:, :2] / z, (flow[:, :2] - flow[:, 2:] * local[:, :2] / z) / z
-    delay = camera.line_delay
+    speed = (flow[:, :2] - flow[:, 2:] * plane) / depth
     # Time of the row in which the moved point lies: t = delay (fy y + cy + 0.5 - H / 2).
-    offset = delay * (camera.fy * plane[:, 1] + camera.cy + 0.5 - 0.5 * camera.height)
-    seconds = offset / (1.0 - delay * camera.fy * speed[:, 1])
+    row = camera.fy * plane[:, 1] + camera.cy + _HALF_PIXEL - 0.5 * camera.height
+    row_speed = camera.fy * speed[:, 1]
+    seconds = camera.line_delay * row / (1.0 - camera.line_delay * row_speed)
     return np.column_stack([plane + seconds[:, None] * speed, np.ones(len(k))])
 
 
@@ -138,7 +170,7 @@ def path(rows: RowTrajectory) -> Placement:
 
     def place(model: Model, k: Ints, points: Array, at: Array) -> Array:
         R, p = rows.pose(model.times_of(k, at))
-        return np.einsum('nji,nj->ni', R, points - p)
+        return rotated_back(R, points - p)
 
     return place
 
@@ -146,7 +178,7 @@ def path(rows: RowTrajectory) -> Placement:
 def projected(place: Placement, model: Model, k: Ints, points: Array, rows: Array) -> Array:
     """Pixels (N, 2) of points at the poses of their own rows; `rows` (N,): first guesses."""
     pixels = np.column_stack([rows, rows])
-    for _ in range(6):
+    for _ in range(_ROW_ROUNDS):
         pixels = model.camera.project(place(model, k, points, pixels[:, 1]))
     return pixels
 
@@ -176,27 +208,33 @@ def fitted(camera: RollingShutterCamera, radial: int) -> RollingShutterCamera:
     lens = lens_of(camera)
     if lens.fisheye or not (any(lens.k[radial:]) or any(lens.s)):
         return camera
-    u, v = np.meshgrid(
-        *(np.linspace(0.0, size - 1.0, 41) for size in (camera.width, camera.height))
-    )
-    pixels = np.column_stack([u.ravel(), v.ravel()])
+    columns = np.linspace(0.0, camera.width - 1.0, _FIT_GRID)
+    rows = np.linspace(0.0, camera.height - 1.0, _FIT_GRID)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     rays = camera.unproject(pixels)
     known = np.isfinite(rays).all(axis=1)
-    x, y = (rays[known, :2] / rays[known, 2:]).T
+    plane = rays[known, :2] / rays[known, 2:]
+    distorted = (pixels[known] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    design = _distortion_columns(plane, radial)
+    right = (distorted - plane).T.ravel()
+    found = np.linalg.lstsq(design, right, rcond=None)[0].tolist()
+    k1, k2, *k3 = found[:radial]
+    p1, p2 = found[radial:]
+    distortion = (k1, k2, p1, p2, *(k3 or [0.0]))
+    return replace(camera, distortion_model='plumb_bob', distortion=distortion)
+
+
+def _distortion_columns(plane: Array, radial: int) -> Array:
+    """Derivatives (2 N, radial + 2) of x, then y, of distorted points by k1 to k`radial`, p1, p2.
+
+    `plane` (N, 2): undistorted points in the plane at depth 1.
+    """
+    x, y = plane.T
     r2 = x * x + y * y
     columns = [np.concatenate([x * r2**i, y * r2**i]) for i in range(1, radial + 1)]
-    columns += [
-        np.concatenate([2.0 * x * y, r2 + 2.0 * y * y]),
-        np.concatenate([r2 + 2.0 * x * x, 2.0 * x * y]),
-    ]
-    right = (pixels[known] - (camera.cx, camera.cy)) / (camera.fx, camera.fy) - np.column_stack(
-        [x, y]
-    )
-    found = np.linalg.lstsq(np.column_stack(columns), right.T.ravel(), rcond=None)[0].tolist()
-    k1, k2, *k3 = found[:radial]
-    return replace(
-        camera, distortion_model='plumb_bob', distortion=(k1, k2, *found[radial:], *(k3 or [0.0]))
-    )
+    columns.append(np.concatenate([2.0 * x * y, r2 + 2.0 * y * y]))
+    columns.append(np.concatenate([r2 + 2.0 * x * x, 2.0 * x * y]))
+    return np.column_stack(columns)
 
 
 # -- exporters ------------------------------------------------------------------------------------
@@ -217,87 +255,80 @@ def _write_colmap(model: Model, folder: Path) -> None:
     colmap 5d968cf, doc/format.rst, doc/cameras.rst: from world to camera, Hamilton quaternion w
     first, two lines per image.
     """
-    camera, lens = model.camera, lens_of(model.camera)
-    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
-    k, p = list(lens.k), list(lens.p)
-    if lens.fisheye:
-        name, values = 'OPENCV_FISHEYE', values + k
-    elif any(k[2:]):
-        name, values = 'FULL_OPENCV', [*values, *k[:2], *p, *k[2:]]
-    else:
-        name, values = ('OPENCV', [*values, *k[:2], *p]) if any(k + p) else ('PINHOLE', values)
     out = folder / 'sparse' / '0'
-    _lines(
-        out / 'cameras.txt',
-        '# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]',
-        f'1 {name} {camera.width} {camera.height} {_text(values)}',
-    )
+    _lines(out / 'cameras.txt', *_colmap_camera(model.camera))
+    order = np.argsort(model.observed[:, 0], kind='stable')
+    frames, points = model.observed[order].T
+    begins = np.searchsorted(frames, np.arange(len(model.names) + 1))
     images = [
         '# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME',
         '# POINTS2D[] as (X, Y, POINT3D_ID)',
     ]
-    order = np.argsort(model.observed[:, 0], kind='stable')
-    frames, points = model.observed[order].T
-    begins = np.searchsorted(frames, np.arange(len(model.names) + 1))
+    # Of each point the images in which it is observed, with its position in their lists.
     tracks: list[list[str]] = [[] for _ in model.points]
-    for f, image in enumerate(model.names):
-        R = model.R[f, MIDDLE].T
-        quat = Rotation.from_matrix(R).as_quat()[[3, 0, 1, 2]]
-        t = -R @ model.positions[f, MIDDLE]
-        images.append(f'{f + 1} {_text(quat)} {_text(t)} 1 {image}')
-        mine = slice(begins[f], begins[f + 1])
-        for index, point in enumerate(points[mine]):
-            tracks[point].append(f'{f + 1} {index}')
-        images.append(
-            ' '.join(
-                f'{x:.4f} {y:.4f} {point + 1}'
-                for (x, y), point in zip(
-                    model.pixels[order[mine]] + 0.5, points[mine], strict=True
-                )
-            )
-        )
+    for frame, image in enumerate(model.names):
+        R = model.R[frame, MIDDLE].T
+        quat_wxyz = Rotation.from_matrix(R).as_quat()[[3, 0, 1, 2]]
+        t = -R @ model.positions[frame, MIDDLE]
+        images.append(f'{frame + 1} {_text(quat_wxyz)} {_text(t)} 1 {image}')
+        mine = slice(begins[frame], begins[frame + 1])
+        pixels = model.pixels[order[mine]] + _HALF_PIXEL
+        observed = []
+        for index, (point, (x, y)) in enumerate(zip(points[mine], pixels, strict=True)):
+            tracks[point].append(f'{frame + 1} {index}')
+            observed.append(f'{x:.4f} {y:.4f} {point + 1}')
+        images.append(' '.join(observed))
     _lines(out / 'images.txt', *images)
-    _lines(
-        out / 'points3D.txt',
-        '# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)',
-        *(
-            f'{i + 1} {_text(point)} {_text(color)} {error:.4f} {" ".join(track)}'
-            for i, (point, color, error, track) in enumerate(
-                zip(model.points, model.colors, model.errors, tracks, strict=True)
-            )
-        ),
+    lines = ['# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)']
+    for point, track in enumerate(tracks):
+        color, error = _text(model.colors[point]), model.errors[point]
+        place = _text(model.points[point])
+        lines.append(f'{point + 1} {place} {color} {error:.4f} {" ".join(track)}')
+    _lines(out / 'points3D.txt', *lines)
+
+
+def _colmap_camera(camera: RollingShutterCamera) -> tuple[str, str]:
+    """Lines of COLMAP's cameras.txt, by the simplest model that holds the lens."""
+    lens = lens_of(camera)
+    first, rest = lens.k[:2], lens.k[2:]
+    if lens.fisheye:
+        name, distortion = 'OPENCV_FISHEYE', lens.k
+    elif any(rest):
+        name, distortion = 'FULL_OPENCV', (*first, *lens.p, *rest)
+    elif any(first + lens.p):
+        name, distortion = 'OPENCV', (*first, *lens.p)
+    else:
+        name, distortion = 'PINHOLE', ()
+    values = [*_focal_and_centre(camera), *distortion]
+    return (
+        '# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]',
+        f'1 {name} {camera.width} {camera.height} {_text(values)}',
     )
 
 
+def _focal_and_centre(camera: RollingShutterCamera) -> tuple[float, float, float, float]:
+    """Focal lengths, and the principal point from the corner of the first pixel [px]."""
+    return camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL
+
+
 def _write_transforms(
-    model: Model,
-    folder: Path,
-    more: Mapping[str, Any],
-    of_frame: Callable[[int], Mapping[str, Any]],
+    model: Model, folder: Path, more: Mapping[str, Any], of_frames: Mapping[str, Array]
 ) -> None:
-    """The transforms.json of instant-ngp and nerfstudio, with entries of their own."""
+    """The transforms.json of instant-ngp and nerfstudio, with entries of their own.
+
+    `of_frames`: arrays (F, ...) by the key that they have in each frame.
+    """
     camera, lens = model.camera, lens_of(model.camera)
-    terms = [
-        *zip(('k1', 'k2', 'k3', 'k4'), lens.k, strict=False),
-        *zip(('p1', 'p2'), lens.p, strict=True),
-    ]
-    value = {
-        'w': camera.width,
-        'h': camera.height,
-        'fl_x': camera.fx,
-        'fl_y': camera.fy,
-        'cx': camera.cx + 0.5,
-        'cy': camera.cy + 0.5,
-        **{name: value for name, value in terms if value},
-        **more,
-        'frames': [
-            {
-                'file_path': f'{IMAGES}/{name}',
-                **{key: np.asarray(value).tolist() for key, value in of_frame(f).items()},
-            }
-            for f, name in enumerate(model.names)
-        ],
-    }
+    value: dict[str, Any] = {'w': camera.width, 'h': camera.height}
+    value |= zip(('fl_x', 'fl_y', 'cx', 'cy'), _focal_and_centre(camera), strict=True)
+    terms = dict(zip(('k1', 'k2', 'k3', 'k4', 'p1', 'p2'), lens.k[:4] + lens.p, strict=True))
+    value |= {name: term for name, term in terms.items() if term}
+    value |= more
+    frames = []
+    for f, name in enumerate(model.names):
+        entries = {key: values[f].tolist() for key, values in of_frames.items()}
+        frames.append({'file_path': f'{IMAGES}/{name}', **entries})
+    value['frames'] = frames
     _lines(folder / 'transforms.json', json.dumps(value, indent=1))
 
 
@@ -310,8 +341,8 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
     are read upwards the velocities have the other sign. nerfstudio 50e0e3c ignores what it does
     not know.
     """
-    sign = 1.0 if model.camera.readout_direction == 'down' else -1.0
-    flip, poses = sign * np.diag(_OPENGL)[:3], model.poses[:, MIDDLE] @ _OPENGL
+    sign = 1.0 if model.reads_down else -1.0
+    flip = sign * np.diag(_OPENGL)[:3]
     _write_transforms(
         model,
         folder,
@@ -323,12 +354,13 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
             'rolling_shutter_time': model.camera.readout_time,
             'exposure_time': model.exposure_time,
         },
-        lambda f: {
-            'transform_matrix': poses[f],
-            'camera_linear_velocity': flip * model.velocities[f],
-            'camera_angular_velocity': flip * model.rates[f],
+        {
+            'transform_matrix': model.poses[:, MIDDLE] @ _OPENGL,
+            'camera_linear_velocity': flip * model.velocities,
+            'camera_angular_velocity': flip * model.rates,
         },
     )
+    points = zip(model.points, model.colors, strict=True)
     _lines(
         folder / 'sparse_pc.ply',
         'ply',
@@ -337,10 +369,7 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
         *(f'property float {axis}' for axis in 'xyz'),
         *(f'property uchar {name}' for name in ('red', 'green', 'blue')),
         'end_header',
-        *(
-            f'{_text(point)} {_text(color)}'
-            for point, color in zip(model.points, model.colors, strict=True)
-        ),
+        *(f'{_text(point)} {_text(color)}' for point, color in points),
     )
 
 
@@ -351,12 +380,14 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
     slerp and lerp at ``t = A + B u + C v`` with v = (row + 0.5) / H. `scale` and `offset` put the
     cameras into the middle half of its unit cube.
     """
-    height, poses = model.camera.height, model.poses @ _OPENGL
+    height = model.camera.height
+    poses = model.poses @ _OPENGL
     places = model.positions[:, MIDDLE]
     low, high = places.min(axis=0), places.max(axis=0)
-    scale = 0.5 / max(float((high - low).max()), 1e-6)
+    size = float((high - low).max())
+    scale = 0.5 / max(size, 1e-6)
     shutter = np.array([-0.5, 0.0, height, 0.0]) / (height - 1.0)
-    if model.camera.readout_direction == 'up':
+    if not model.reads_down:
         shutter = np.array([1.0, 0.0, 0.0, 0.0]) - shutter
     _write_transforms(
         model,
@@ -368,10 +399,10 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
             'scale': scale,
             'offset': (0.5 - 0.5 * scale * (low + high)).tolist(),
         },
-        lambda f: {
-            'transform_matrix': poses[f, MIDDLE],
-            'transform_matrix_start': poses[f, START],
-            'transform_matrix_end': poses[f, END],
+        {
+            'transform_matrix': poses[:, MIDDLE],
+            'transform_matrix_start': poses[:, START],
+            'transform_matrix_end': poses[:, END],
         },
     )
 
@@ -386,8 +417,10 @@ def _write_gsplat(model: Model, folder: Path) -> None:
     camera, lens = model.camera, lens_of(model.camera)
     views = np.linalg.inv(model.poses)
     K = camera.camera_matrix
-    K[:2, 2] += 0.5
-    down = camera.readout_direction == 'down'
+    K[:2, 2] += _HALF_PIXEL
+    shutter = 4
+    if model.rolls:
+        shutter = 0 if model.reads_down else 2
     with (folder / 'cameras.npz').open('wb') as file:
         np.savez_compressed(
             file,
@@ -396,7 +429,7 @@ def _write_gsplat(model: Model, folder: Path) -> None:
             Ks=np.tile(K, (len(views), 1, 1)),
             width=camera.width,
             height=camera.height,
-            rolling_shutter=4 if not model.rolls else 0 if down else 2,
+            rolling_shutter=shutter,
             camera_model='fisheye' if lens.fisheye else 'pinhole',
             radial_coeffs=lens.k,
             tangential_coeffs=lens.p,
@@ -423,80 +456,35 @@ def _write_ncore(model: Model, folder: Path) -> None:
             'the format ncore needs the package nvidia-ncore: pip install '
             f"'rs_relpose_ros[ncore]' ({error})"
         ) from None
-    camera, lens = model.camera, lens_of(model.camera)
-    kinds = types.ShutterType
-    shutter = (
-        kinds.GLOBAL
-        if not model.rolls
-        else kinds.ROLLING_TOP_TO_BOTTOM
-        if (camera.readout_direction == 'down')
-        else kinds.ROLLING_BOTTOM_TO_TOP
-    )
-    single = {
-        name: np.array(value, dtype=np.float32)
-        for name, value in {
-            'principal_point': (camera.cx + 0.5, camera.cy + 0.5),
-            'focal_length': (camera.fx, camera.fy),
-            'radial_coeffs': lens.k,
-        }.items()
-    }
-    common = {
-        'resolution': np.array([camera.width, camera.height], dtype=np.uint64),
-        'shutter_type': shutter,
-        'external_distortion_parameters': None,
-        **single,
-    }
-    corners = camera.unproject(
-        np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (camera.width, camera.height)
-    )[:, 2]
-    parameters = (
-        types.OpenCVFisheyeCameraModelParameters(
-            **common, max_angle=float(np.arccos(np.nanmin(corners)))
-        )
-        if lens.fisheye
-        else types.OpenCVPinholeCameraModelParameters(
-            **common,
-            tangential_coeffs=np.array(lens.p, dtype=np.float32),
-            thin_prism_coeffs=np.array(lens.s, dtype=np.float32),
-        )
-    )
     both = [START, END] if model.rolls else [MIDDLE, MIDDLE]
     times = np.rint(model.times_ns[:, both] / 1000.0).astype(np.uint64)
     ends, first = np.unique(times, return_index=True)
-    writer = v4.SequenceComponentGroupsWriter(
-        folder,
-        'recording',
-        'recording',
-        HalfClosedInterval.from_start_end(int(ends[0]), int(ends[-1])),
-        {},
-    )
+    span = HalfClosedInterval.from_start_end(int(ends[0]), int(ends[-1]))
+    writer = v4.SequenceComponentGroupsWriter(folder, 'recording', 'recording', span, {})
     register = writer.register_component_writer
-    register(v4.PosesComponent.Writer, 'default').store_dynamic_pose(
-        CAMERA_ID, 'world', model.poses[:, both].reshape(-1, 4, 4)[first], ends
-    )
-    register(v4.IntrinsicsComponent.Writer, 'default').store_camera_intrinsics(
-        CAMERA_ID, parameters
-    )
+    poses = register(v4.PosesComponent.Writer, 'default')
+    of_ends = model.poses[:, both].reshape(-1, 4, 4)[first]
+    poses.store_dynamic_pose(CAMERA_ID, 'world', of_ends, ends)
+    intrinsics = register(v4.IntrinsicsComponent.Writer, 'default')
+    intrinsics.store_camera_intrinsics(CAMERA_ID, _ncore_camera(model, types))
     # Its loader requires masks and cuboids, if only empty.
     register(v4.MasksComponent.Writer, 'default').store_camera_masks(CAMERA_ID, {})
     register(v4.CuboidsComponent.Writer, 'default').store_observations([])
     frames = register(v4.CameraSensorComponent.Writer, CAMERA_ID)
-    for name, span in zip(model.names, times, strict=True):
+    for name, span_us in zip(model.names, times, strict=True):
         image = folder / IMAGES / name
-        frames.store_frame(
-            image.read_bytes(), image.suffix[1:].replace('jpg', 'jpeg'), span, {}, {}
-        )
+        kind = image.suffix[1:].replace('jpg', 'jpeg')
+        frames.store_frame(image.read_bytes(), kind, span_us, {}, {})
+    color = v4.PointCloudsComponent.AttributeSchema(
+        transform_type=types.PointCloud.AttributeTransformType.INVARIANT,
+        dtype=np.dtype('uint8'),
+        shape_suffix=(3,),
+    )
     clouds = register(
         v4.PointCloudsComponent.Writer,
         'landmarks',
         coordinate_unit=types.PointCloud.CoordinateUnit.METERS,
-        attribute_schemas={
-            'rgb': v4.PointCloudsComponent.AttributeSchema(
-                transform_type=types.PointCloud.AttributeTransformType.INVARIANT,
-                dtype=np.dtype('uint8'),
-                shape_suffix=(3,),
-            )
-        },
+        attribute_schemas={'rgb': color},
     )
     clouds.store_pc(
         xyz=model.points.astype(np.float32),
@@ -507,7 +495,32 @@ def _write_ncore(model: Model, folder: Path) -> None:
     writer.finalize()
 
 
-CAMERA_ID = 'camera'
+def _ncore_camera(model: Model, types: Any) -> Any:
+    """Camera parameters of NCore; `types`: its module ``ncore.impl.data.types``."""
+    camera, lens = model.camera, lens_of(model.camera)
+    shutter = types.ShutterType.GLOBAL
+    if model.rolls:
+        down = types.ShutterType.ROLLING_TOP_TO_BOTTOM
+        shutter = down if model.reads_down else types.ShutterType.ROLLING_BOTTOM_TO_TOP
+    fx, fy, cx, cy = _focal_and_centre(camera)
+    common = {
+        'resolution': np.array([camera.width, camera.height], dtype=np.uint64),
+        'shutter_type': shutter,
+        'external_distortion_parameters': None,
+        'principal_point': np.array([cx, cy], dtype=np.float32),
+        'focal_length': np.array([fx, fy], dtype=np.float32),
+        'radial_coeffs': np.array(lens.k, dtype=np.float32),
+    }
+    if lens.fisheye:
+        size = np.array([camera.width, camera.height])
+        corners = camera.unproject(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size)
+        max_angle = float(np.arccos(np.nanmin(corners[:, 2])))
+        return types.OpenCVFisheyeCameraModelParameters(**common, max_angle=max_angle)
+    return types.OpenCVPinholeCameraModelParameters(
+        **common,
+        tangential_coeffs=np.array(lens.p, dtype=np.float32),
+        thin_prism_coeffs=np.array(lens.s, dtype=np.float32),
+    )
 
 
 class Format(NamedTuple):

@@ -20,8 +20,8 @@ from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
-from rs_relpose_ros.odometry.landmarks import Tracks, TRACKS_FILE
 from rs_relpose_ros.odometry.loops import close_loops, View
+from rs_relpose_ros.odometry.map_points import KeyframeObservations, TRACKS_FILE
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.rows import camera_poses, Knot, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
@@ -71,12 +71,12 @@ def odometry_into(
     )
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
-    observed: list[Tracks] = []
+    observed: list[KeyframeObservations] = []
     views: dict[int, View] = {}
 
     def pairs() -> Iterator[tuple[int, KeyframePair]]:
         for pair in replay.pairs():
-            observed.append(Tracks.of_pair(pair))
+            observed.append(KeyframeObservations.of_pair(pair))
             given = KeyframePair.of_result(pair)
             views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
             yield replay.last_ns, given
@@ -124,7 +124,7 @@ def odometry_into(
             taken,
         )
         rows.save(folder / ROWS_FILE)
-        Tracks.merged(observed).save(folder / TRACKS_FILE)
+        KeyframeObservations.merged(observed).save(folder / TRACKS_FILE)
         if rate:
             write_tum(folder / RATE_FILE, camera_poses(rows, rate))
     draw_paths(drawn, folder / PICTURE)
