@@ -25,7 +25,15 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
-from rs_relpose_ros.odometry.offline import draw_paths, path_of, write_tum
+from rs_relpose_ros.odometry.offline import (
+    consistency,
+    draw_paths,
+    follow,
+    path_of,
+    PublishedStates,
+    write_states,
+    write_tum,
+)
 from rs_relpose_ros.odometry.pair import deviations, KeyframePair
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -1030,7 +1038,7 @@ def test_the_plot_has_one_time_axis_and_the_whole_truth(walked, tracked, tmp_pat
 
 def test_tum_files_are_exact_to_the_nanosecond(tracked, tmp_path):
     out = tracked[1]
-    write_tum(tmp_path / 'path.tum', out)
+    write_tum(tmp_path / 'path.tum', [(one.stamp_ns, one.R, one.position) for one in out])
     lines = (tmp_path / 'path.tum').read_text().splitlines()
     assert len(lines) == len(out)
     seconds, *values = lines[-1].split()
@@ -1039,3 +1047,73 @@ def test_tum_files_are_exact_to_the_nanosecond(tracked, tmp_path):
     np.testing.assert_allclose(
         Rotation.from_quat([float(x) for x in values[3:]]).as_matrix(), out[-1].R, atol=1e-7
     )
+
+
+def test_states_are_written_as_they_are(walked, tmp_path):
+    """A camera that is not the base: its pose, velocity and covariance by samples of the base."""
+    estimator = OdometryEstimator(OF_BASE)
+    states = PublishedStates(estimator, 30.0)
+    pairs = [(pair.current_ns + SECOND // 50, pair) for pair in walked.pairs[:20]]
+    samples = [(sample.stamp_ns, sample) for sample in samples_of(walked, -1.0, 3.2)]
+    follow(estimator, pairs, samples, states.after)
+    assert len(states.published) > 50
+    assert np.diff([state.imu_ns for state in states.published]).max() < 0.04 * SECOND
+    base, camera = states.published[-1], BASE.camera(states.published[-1])
+    write_states(tmp_path / 'odometry.csv', [camera])
+    header, line = (tmp_path / 'odometry.csv').read_text().splitlines()
+    names = header.split(',')
+    expected = 'stamp_ns,imu_ns,path,x,y,z,qx,qy,qz,qw,vx,vy,vz,'
+    assert header.startswith(expected)
+    assert names[13:] == [f'c{i}{j}' for i in range(6) for j in range(6)]
+    assert line.split(',')[:3] == [str(base.stamp_ns), str(base.imu_ns), '0']
+    numbers = np.array([float(text) for text in line.split(',')[3:]])
+    np.testing.assert_array_equal(numbers[:3], camera.position)
+    np.testing.assert_allclose(
+        Rotation.from_quat(numbers[3:7]).as_matrix(), base.R @ BASE.R, atol=1e-12
+    )
+    swing = np.cross(base.angular_velocity, BASE.position)
+    np.testing.assert_allclose(numbers[7:10], base.R @ (base.velocity + swing), atol=1e-12)
+    # By the errors of the base's pose that its covariance allows.
+    errors = np.random.default_rng(1).multivariate_normal(np.zeros(6), base.pose_covariance, 4000)
+    arms = np.array([exp_so3(error[3:]) @ base.R @ BASE.position for error in errors])
+    moved = np.column_stack([errors[:, :3] + arms, errors[:, 3:]])
+    sigmas = np.sqrt(np.diag(camera.pose_covariance))
+    np.testing.assert_allclose(
+        np.cov(moved.T) / np.outer(sigmas, sigmas),
+        numbers[10:].reshape(6, 6) / np.outer(sigmas, sigmas),
+        atol=0.08,
+    )
+
+
+def test_consistency_is_that_of_the_covariances(walked, tracked):
+    """Errors of 2 sigma in each axis: 4 per degree of freedom, and 12 is within 99.7 %."""
+    _, keyframes = tracked
+    origin = keyframes[3]
+    R0, p0 = walked.truth.rotation(origin.imu_ns), walked.truth.position(origin.imu_ns)
+    turn = exp_so3(np.array([0.0, 0.0, 0.4]))  # the heading of the truth's world is another
+    covariance = np.diag(np.square([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
+
+    def state_at(imu_ns, sigmas):
+        error = sigmas * np.sqrt(np.diag(covariance))
+        R = turn @ walked.truth.rotation(imu_ns)
+        velocity = R.T @ turn @ walked.truth.velocity(imu_ns)
+        return replace(
+            origin,
+            imu_ns=imu_ns,
+            position=turn @ (walked.truth.position(imu_ns) - p0) + 5.0 + error[:3],
+            R=exp_so3(error[3:]) @ R,
+            velocity=velocity + error[:3],
+            pose_covariance=covariance,
+            velocity_covariance=covariance,
+        )
+
+    first = replace(origin, R=turn @ R0, position=np.full(3, 5.0))
+    times = [keyframe.imu_ns for keyframe in keyframes[10:14]]
+    found = consistency([state_at(at, 2.0) for at in times], first, walked.truth)
+    for name in ('position', 'rotation', 'velocity'):
+        assert found['nees'][name] == pytest.approx(4.0, rel=1e-3)
+        assert found['beyond'][name] == 0.0
+    found = consistency([state_at(times[0], 2.0), state_at(times[1], 2.2)], first, walked.truth)
+    assert found['beyond'] == {'position': 0.5, 'rotation': 0.5, 'velocity': 0.5}
+    late = replace(origin, imu_ns=origin.imu_ns + 100 * SECOND)
+    assert consistency([late], first, walked.truth) == {'nees': None, 'beyond': None}

@@ -149,7 +149,7 @@ def test_depth_of_the_scene_is_that_of_parallaxes():
         )
         for k in range(4)
     ]
-    views = {k: loops.View(k, parallax) for k, parallax in enumerate((9.0, 9.0, 9.0, 0.1))}
+    views = {k: (k, parallax) for k, parallax in enumerate((9.0, 9.0, 9.0, 0.1))}
     assert loops.scene_depth(poses, views, 450.0) == pytest.approx(5.0)
     assert math.isnan(loops.scene_depth(poses[:1], views, 450.0))
 
@@ -182,6 +182,8 @@ def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys
     assert len(rows.loops_ns) == found['taken']
     assert np.isin(rows.loops_ns, rows.keyframes_ns[:, 1]).all()
     assert (np.diff(rows.loops_ns) > 1.9e9).all()
+    assert all(0.0 < value < 3.0 for value in summary['nees'].values())
+    assert summary['beyond'] == {'position': 0.0, 'rotation': 0.0, 'velocity': 0.0}
 
 
 @pytest.mark.long

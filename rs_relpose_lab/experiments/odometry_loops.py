@@ -24,7 +24,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
-from rs_relpose_ros.odometry.loops import close_loops, View
+from rs_relpose_ros.odometry.loops import close_loops
 from rs_relpose_ros.odometry.offline import follow, path_of
 from rs_relpose_ros.odometry.pair import deviations, KeyframePair, square_root
 from rs_relpose_ros.odometry.states import Odometry
@@ -94,7 +94,7 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     pairs, views = [], {}
     for pair, _ in trust_runs.run(recording, recording.configured):
         given = KeyframePair.of_result(pair)
-        views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
+        views[given.current_ns + given.row_ns] = pair.stamp_ns, pair.parallax
         pairs.append((arrives[pair.stamp_ns], given))
     estimator = OdometryEstimator(parameters, keep=True)
     delay_ns = to_nanoseconds(IMU_DELAY)

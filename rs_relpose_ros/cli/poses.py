@@ -320,10 +320,11 @@ ODOMETRY = Command(
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
     'graph (gtsam, an extra), as in odometry_node. Writes trajectory.tum (live estimates of the '
     "camera, z up, stamped with the image's middle row on the camera's clock), "
-    'trajectory_smoothed.tum (estimates from all data), trajectory_rows.npz (poses at any time, '
-    'RowTrajectory in Python), tracks.npz (for export), summary.json and a picture; with errors '
-    'if the bag contains ground truth of the camera. The parameter imu_position should be '
-    'configured. Exit code 1: odometry did not start.',
+    'trajectory_smoothed.tum (estimates from all data), odometry.csv (every state as published '
+    'live, with velocity and covariance), trajectory_rows.npz (poses at any time, RowTrajectory '
+    'in Python), tracks.npz (for export), summary.json and a picture; with errors, NEES and the '
+    'share of states beyond 99.7 % if the bag contains ground truth of the camera. The parameter '
+    'imu_position should be configured. Exit code 1: odometry did not start.',
     options.declared(
         {
             **options.of_run('odometry'),

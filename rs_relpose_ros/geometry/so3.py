@@ -192,6 +192,11 @@ def skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
+def heading(R: Array) -> Array:
+    """Rotation vector (3,) about z [rad] that is closest to a rotation matrix (3, 3)."""
+    return np.array([0.0, 0.0, math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])])
+
+
 def by_axes(matrix: Array) -> Array:
     """Kronecker product (3 n, 3 m) of a matrix (n, m) and the identity (3, 3)."""
     n, m = matrix.shape

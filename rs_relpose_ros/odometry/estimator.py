@@ -15,7 +15,7 @@ import numpy as np
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import exp_so3, skew, STANDARD_GRAVITY
+from rs_relpose_ros.geometry.so3 import exp_so3, heading, skew, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import StuckGyro
@@ -764,6 +764,5 @@ def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
     )
     R = R @ axes
     if path_end.R is not None:
-        M = path_end.R @ R.T
-        R = exp_so3(np.array([0.0, 0.0, math.atan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])])) @ R
+        R = exp_so3(heading(path_end.R @ R.T)) @ R
     return np.asarray(R)

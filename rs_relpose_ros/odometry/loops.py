@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,33 +18,40 @@ from rs_relpose_ros.pipeline.pair import PairResult
 
 # The smoothed keyframes of each start.
 Paths = list[list[tuple[KeyframeState, Odometry]]]
+# By the time of a keyframe on the IMU's clock: the stamp of the row of its pose [ns], and the
+# parallax to the keyframe before [px].
+Views = Mapping[int, tuple[int, float]]
 
-# Least time between the two keyframes of a loop, and between those of two loops [s].
-_APART, _SPACING = 10.0, 1.0
-# Loops per second of the path, at most.
+# Least time between the two keyframes of a loop [s]. Closer ones share tracks already, so that a
+# loop adds nothing. [chosen: 5 to 30 s would do]
+_APART = 10.0
+# Least time between two loops at one of their ends [s]: closer ones share both images and repeat
+# each other. [chosen: 0.5 to 3 s would do]
+_SPACING = 1.0
+# Largest number of loops per second of the path: each costs 0.5 s of a core.
+# [measured: docs/lab/odometry.md, "Loop closures"]
 _RATE = 1.0
-# Least share of a view that is in the other one; longest baseline in depths of the scene.
-_LEAST_OVERLAP, _LONGEST_BASELINE = 0.5, 0.4
-# Points of a view: columns and rows.
+# Least share of a view that is in the other one. Descriptors match too few points below it; above
+# 0.7 loops with another heading are lost. [chosen: 0.3 to 0.7 would do]
+_LEAST_OVERLAP = 0.5
+# Longest baseline of a loop in depths of the scene: descriptors of views from other sides do not
+# match. [chosen: 0.2 to 0.6 would do]
+_LONGEST_BASELINE = 0.4
+# Points of a view: columns and rows. [chosen: a share is then known to 2 %]
 _GRID = (8, 6)
-# Least parallax of a pair that gives a depth [px].
+# Least parallax of a pair that gives a depth [px]: the noise of matches is 0.5 px.
+# [chosen: 1 to 10 px would do, as the median over all pairs counts]
 _LEAST_PARALLAX = 2.0
 
 
-class View(NamedTuple):
-    """The image of a keyframe."""
-
-    stamp_ns: int  # of its pose's row
-    parallax: float  # [px] to the keyframe before
-
-
-def scene_depth(path: Sequence[Odometry], views: Mapping[int, View], focal_length: float) -> float:
-    """Median distance of the scene [m]; `views`: by `imu_ns`; NaN without any."""
-    depths = [
-        focal_length * float(np.linalg.norm(two.position - one.position)) / parallax
-        for one, two in pairwise(path)
-        if (parallax := views[two.imu_ns].parallax) > _LEAST_PARALLAX
-    ]
+def scene_depth(path: Sequence[Odometry], views: Views, focal_length: float) -> float:
+    """Median distance of the scene [m]; NaN without any."""
+    depths = []
+    for one, two in pairwise(path):
+        _, parallax = views[two.imu_ns]
+        if parallax > _LEAST_PARALLAX:
+            baseline = float(np.linalg.norm(two.position - one.position))
+            depths.append(focal_length * baseline / parallax)
     return float(np.median(depths)) if depths else math.nan
 
 
@@ -57,21 +64,19 @@ def proposed_loops(
     similar views first, and none within a second of another one at both ends.
     """
     seconds = np.array([pose.imu_ns - path[0].imu_ns for pose in path]) / NANOSECONDS
-    found = [
-        (share, i, j)
-        for j, pose in enumerate(path)
-        for share, i in _common_views(
-            path[: int(np.searchsorted(seconds, seconds[j] - _APART))], pose, depth, camera
-        )
-    ]
+    found = []
+    for j, pose in enumerate(path):
+        last = int(np.searchsorted(seconds, seconds[j] - _APART))
+        views = _common_views(path[:last], pose, depth, camera)
+        found += [(share, i, j) for share, i in views]
     chosen: list[tuple[int, int]] = []
     for _, i, j in sorted(found, key=lambda one: -one[0]):
         if len(chosen) >= _RATE * seconds[-1]:
             break
-        if all(
-            max(abs(seconds[i] - seconds[k]), abs(seconds[j] - seconds[m])) >= _SPACING
-            for k, m in chosen
-        ):
+        distances = [
+            max(abs(seconds[i] - seconds[k]), abs(seconds[j] - seconds[m])) for k, m in chosen
+        ]
+        if min(distances, default=math.inf) >= _SPACING:
             chosen.append((i, j))
     return chosen
 
@@ -79,7 +84,7 @@ def proposed_loops(
 def _common_views(
     earlier: Sequence[Odometry], pose: Odometry, depth: float, camera: RollingShutterCamera
 ) -> list[tuple[float, int]]:
-    """Shares of the view that others have, of those with a large one, and their positions."""
+    """Earlier keyframes that share a large part of a view: the share, and their position."""
     near = [
         k
         for k, one in enumerate(earlier)
@@ -89,60 +94,59 @@ def _common_views(
     if not near:
         return []
     last = np.array([camera.width, camera.height]) - 1.0
-    grid = np.meshgrid(
-        *(np.linspace(0.0, end, count) for end, count in zip(last, _GRID, strict=True))
-    )
-    rays = camera.unproject(np.stack(grid, axis=-1).reshape(-1, 2))
-    points = pose.position + depth * rays @ pose.R.T
-    in_view = np.stack([(points - earlier[k].position) @ earlier[k].R for k in near])
-    pixels = camera.project(in_view.reshape(-1, 3))  # NaN behind the camera
-    # With a margin for rounding, as a view has all of itself.
-    inside = ((pixels > -1.0) & (pixels < last + 1.0)).all(axis=1)
-    shares = inside.reshape(len(near), -1).mean(axis=1).tolist()
-    return [(share, k) for k, share in zip(near, shares, strict=True) if share >= _LEAST_OVERLAP]
+    columns = np.linspace(0.0, last[0], _GRID[0])
+    rows = np.linspace(0.0, last[1], _GRID[1])
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    points = pose.position + depth * camera.unproject(pixels) @ pose.R.T
+    found = []
+    for k in near:
+        # NaN behind the camera. A margin for rounding, as a view has all of itself.
+        shown = camera.project((points - earlier[k].position) @ earlier[k].R)
+        inside = ((shown > -1.0) & (shown < last + 1.0)).all(axis=1)
+        share = float(inside.mean())
+        if share >= _LEAST_OVERLAP:
+            found.append((share, k))
+    return found
 
 
 def close_loops(
     estimator: OdometryEstimator,
     paths: Paths,
-    views: Mapping[int, View],
+    views: Views,
     sensor: Sensor,
     relate: Callable[[list[Stamps]], Sequence[PairResult]],
 ) -> tuple[Paths, dict[str, Any], list[KeyframePair]]:
-    """Add loops to smoothed paths; `views`: by `imu_ns`; `relate`: results of pairs of stamps."""
+    """Add loops to smoothed paths; `relate`: results of pairs of image stamps.
+
+    Returns the paths with loops, the report for summary.json, and the loops that count.
+    """
     smoothed = [pose for path in paths for _, pose in path]
-    base, later_ns = estimator.base or Base(), to_nanoseconds(sensor.pose_row_delay)
+    base = estimator.base or Base()
     path = [base.camera(pose) for pose in smoothed if pose.imu_ns in views]
-    stamps = [views[pose.imu_ns].stamp_ns - later_ns for pose in path]
-    offered = proposed_loops(path, scene_depth(path, views, sensor.camera.fx), sensor.camera)
-    pairs = (
-        [
-            KeyframePair.of_result(result)
-            for result in relate([(stamps[i], stamps[j]) for i, j in offered])
-        ]
-        if offered
-        else []
-    )
+    delay_ns = to_nanoseconds(sensor.pose_row_delay)
+    stamps = [views[pose.imu_ns][0] - delay_ns for pose in path]
+    depth = scene_depth(path, views, sensor.camera.fx)
+    offered = proposed_loops(path, depth, sensor.camera)
+    related = relate([(stamps[i], stamps[j]) for i, j in offered]) if offered else []
+    pairs = [KeyframePair.of_result(result) for result in related]
     informative = [pair for pair in pairs if pair.images is not None]
     taken = estimator.close_loops(informative)
     paths = estimator.smoothed_paths() if taken else paths
     closed = [pose for path in paths for _, pose in path]
     positions = {pose.imu_ns: pose.position for pose in smoothed}
     shifts = np.array([np.linalg.norm(pose.position - positions[pose.imu_ns]) for pose in closed])
-    before, after = (
-        float(np.linalg.norm(poses[-1].position - poses[0].position))
-        for poses in (smoothed, closed)
-    )
-    return (
-        paths,
-        {  # for summary.json; shifts: of the keyframes' positions
-            'offered': len(offered),
-            'related': len(informative),
-            'taken': len(taken),
-            'shift_m': float(np.sqrt((shifts**2).mean())),
-            'largest_shift_m': float(shifts.max()),
-            'end_to_start_without_m': before,
-            'end_to_start_m': after,
-        },
-        taken,
-    )
+    report = {  # shifts are those of the positions of keyframes
+        'offered': len(offered),
+        'related': len(informative),
+        'taken': len(taken),
+        'shift_m': float(np.sqrt((shifts**2).mean())),
+        'largest_shift_m': float(shifts.max()),
+        'end_to_start_without_m': _end_to_start(smoothed),
+        'end_to_start_m': _end_to_start(closed),
+    }
+    return paths, report, taken
+
+
+def _end_to_start(poses: Sequence[Odometry]) -> float:
+    """Distance of the last position from the first one [m]."""
+    return float(np.linalg.norm(poses[-1].position - poses[0].position))

@@ -1,6 +1,6 @@
 """Metric odometry of a bag, as of a live node, and its errors against the ground truth."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 import math
@@ -9,25 +9,35 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 import numpy as np
+from scipy.special import gammaincinv
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import aligning_rotation
-from rs_relpose_ros.geometry.timing import seconds_between
+from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, heading, log_so3
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
+from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
-from rs_relpose_ros.odometry.loops import close_loops, View
+from rs_relpose_ros.odometry.loops import close_loops, Paths, Views
 from rs_relpose_ros.odometry.map_points import KeyframeObservations, TRACKS_FILE
 from rs_relpose_ros.odometry.pair import KeyframePair
-from rs_relpose_ros.odometry.rows import camera_poses, Knot, ROWS_FILE, RowTrajectory, write_tum
-from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
+from rs_relpose_ros.odometry.rows import (
+    camera_poses,
+    Knot,
+    ROWS_FILE,
+    RowTrajectory,
+    StampedPose,
+    write_tum,
+)
+from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, OdometryState
 from rs_relpose_ros.offline.replay import read_truth, related, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
+from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE, written
+from rs_relpose_ros.pipeline.chosen_pairs import Stamps
 from rs_relpose_ros.pipeline.pair import PairResult
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
@@ -36,8 +46,27 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     'smoothed': {'color': '#0072B2', 'lw': 1.2},
 }
 
-LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
+LIVE_FILE = 'trajectory.tum'
+SMOOTHED_FILE = 'trajectory_smoothed.tum'
+STATES_FILE = 'odometry.csv'
 RATE_FILE = 'trajectory_rows.tum'
+PICTURE = 'path.png'
+_FILES = (
+    LIVE_FILE,
+    SMOOTHED_FILE,
+    STATES_FILE,
+    ROWS_FILE,
+    RATE_FILE,
+    TRACKS_FILE,
+    PICTURE,
+    SUMMARY_FILE,
+)
+# Columns of STATES_FILE: times, path, pose of the camera, its velocity, covariance of the pose.
+_STATE_COLUMNS = (
+    *('stamp_ns', 'imu_ns', 'path'),
+    *('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'vx', 'vy', 'vz'),
+    *(f'c{row}{column}' for row in range(6) for column in range(6)),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,49 +89,37 @@ def odometry_into(
     *,
     loops: bool = False,
 ) -> OdometryOutcome:
-    """Run a bag, and write trajectories, tracks and a picture into `folder`.
+    """Run a bag, and write trajectories, states, tracks and a picture into `folder`.
 
     Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz]. `loops`:
     whether the smoothed path has loop closures.
     """
-    prepare_folder(
-        folder,
-        (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, RATE_FILE, TRACKS_FILE, PICTURE, SUMMARY_FILE),
-    )
+    prepare_folder(folder, _FILES)
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
     observed: list[KeyframeObservations] = []
-    views: dict[int, View] = {}
+    views: dict[int, tuple[int, float]] = {}
 
     def pairs() -> Iterator[tuple[int, KeyframePair]]:
         for pair in replay.pairs():
             observed.append(KeyframeObservations.of_pair(pair))
             given = KeyframePair.of_result(pair)
-            views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
+            views[given.current_ns + given.row_ns] = pair.stamp_ns, pair.parallax
             yield replay.last_ns, given
 
     samples = _samples(bag, topics)
-    live = follow(estimator, pairs(), samples)
-    paths, closed, taken = estimator.smoothed_paths(), None, list[KeyframePair]()
+    states = PublishedStates(estimator, parameters.odometry.odometry_rate)
+    live = follow(estimator, pairs(), samples, states.after)
+    paths = estimator.smoothed_paths()
+    closed, taken = None, list[KeyframePair]()
     if loops and paths:
-        assert replay.intake.intrinsics is not None
-        sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
-        paths, closed, taken = close_loops(
-            estimator,
-            paths,
-            views,
-            sensor,
-            lambda stamps: [
-                pair
-                for pair in related(bag, topics, parameters, stamps)[0]
-                if isinstance(pair, PairResult)
-            ],
-        )
+        paths, closed, taken = _with_loops(estimator, paths, views, replay, bag, topics)
     smoothed = [keyframe for path in paths for _, keyframe in path]
     warnings = estimator.warnings()
     truth = read_truth(bag, topics)
     # The ground truth is that of the camera.
     base = estimator.base or Base()
+    published = [base.camera(state) for state in states.published]
     drawn = {
         name: path_of([base.camera(pose) for pose in trajectory], truth)
         for name, trajectory in (('live', live), ('smoothed', smoothed))
@@ -113,16 +130,14 @@ def odometry_into(
         'health': replay.health.state.value,
         **{name: path.errors and path.errors.as_json() for name, path in drawn.items()},
     }
-    write_tum(folder / LIVE_FILE, live)
-    write_tum(folder / SMOOTHED_FILE, smoothed)
+    if truth is not None and smoothed:
+        metrics |= consistency(published, base.camera(smoothed[0]), truth)
+    write_tum(folder / LIVE_FILE, map(_stamped, live))
+    write_tum(folder / SMOOTHED_FILE, map(_stamped, smoothed))
+    write_states(folder / STATES_FILE, published)
     if paths:
-        rows = row_trajectory(
-            paths,
-            base,
-            parameters,
-            [sample for _, sample in samples if isinstance(sample, ImuSample)],
-            taken,
-        )
+        given = [sample for _, sample in samples if isinstance(sample, ImuSample)]
+        rows = row_trajectory(paths, base, parameters, given, taken)
         rows.save(folder / ROWS_FILE)
         KeyframeObservations.merged(observed).save(folder / TRACKS_FILE)
         if rate:
@@ -131,39 +146,53 @@ def odometry_into(
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
 
 
+def _with_loops(
+    estimator: OdometryEstimator,
+    paths: Paths,
+    views: Views,
+    replay: Replay,
+    bag: Bag,
+    topics: SensorTopics,
+) -> tuple[Paths, dict[str, Any], list[KeyframePair]]:
+    """Smoothed paths with loop closures, their report, and the loops that count."""
+    parameters = replay.parameters
+    assert replay.intake.intrinsics is not None
+
+    def relate(stamps: list[Stamps]) -> list[PairResult]:
+        results, *_ = related(bag, topics, parameters, stamps)
+        return [pair for pair in results if isinstance(pair, PairResult)]
+
+    sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
+    return close_loops(estimator, paths, views, sensor, relate)
+
+
+def _stamped(pose: Odometry) -> StampedPose:
+    """Stamp, rotation and position of a keyframe."""
+    return pose.stamp_ns, pose.R, pose.position
+
+
 def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str, Any]:
     """Counts, intervals, starts and the estimated lever arm, for summary.json."""
-    positions = [pose.position for pose in live]
+    counted = ('pairs', 'contradicting', 'late', 'without images', 'calibration contradicted')
+    intervals: dict[str, list[dict[str, Any]]] = {
+        OdometryState.UNCERTAIN.value: [],
+        OdometryState.LOST.value: [],
+    }
+    for one in estimator.intervals:
+        if one.state.value in intervals:
+            entry = {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
+            intervals[one.state.value].append(entry)
+    arm, arm_sigma = estimator.imu_position
+    positions = np.reshape([pose.position for pose in live], (-1, 3))
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return {
         'keyframes': len(live),
-        'pairs': {
-            name: estimator.counts[name]
-            for name in (
-                'pairs',
-                'contradicting',
-                'late',
-                'without images',
-                'calibration contradicted',
-            )
-        },
-        **{
-            state.value: [
-                {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
-                for one in estimator.intervals
-                if one.state is state
-            ]
-            for state in (OdometryState.UNCERTAIN, OdometryState.LOST)
-        },
-        **{
-            name: value.tolist()
-            for name, value in zip(
-                ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True
-            )
-        },
+        'pairs': {name: estimator.counts[name] for name in counted},
+        **intervals,
+        'imu_position': arm.tolist(),
+        'imu_position_sigma': arm_sigma.tolist(),
         'starts': [asdict(started) for started in estimator.starts],
-        'length_m': float(
-            np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0), axis=1).sum()
-        ),
+        'length_m': float(steps.sum()),
     }
 
 
@@ -184,61 +213,88 @@ def row_trajectory(
             buffer.add(sample)
     C, arm = parameters.sensor.R_cam_imu, paths[-1][-1][0].arm
     base_R = C.T @ base.R.T
-    mounts = np.array(
-        [
-            np.column_stack(mount)
-            for mount in (
-                (C.T, arm),
-                (np.eye(3), np.zeros(3)),
-                (base_R, arm - base_R @ base.position),
-            )
-        ]
-    )
-    # The cameras' positions are kept: the arm of an earlier path may differ.
+    camera_mount = np.column_stack([C.T, arm])
+    imu_mount = np.column_stack([np.eye(3), np.zeros(3)])
+    base_mount = np.column_stack([base_R, arm - base_R @ base.position])
+    knots = [[_knot(state, keyframe, base, arm) for state, keyframe in path] for path in paths]
     return RowTrajectory.of_paths(
-        [
-            [
-                Knot(
-                    keyframe.stamp_ns,
-                    keyframe.imu_ns,
-                    state.R,
-                    base.camera(keyframe).position - state.R @ arm,
-                    state.velocity,
-                    state.gyro_bias,
-                    state.accel_bias,
-                    keyframe.pose_covariance,
-                )
-                for state, keyframe in path
-            ]
-            for path in paths
-        ],
+        knots,
         buffer,
-        mounts,
+        np.array([camera_mount, imu_mount, base_mount]),
         [(loop.reference_ns, loop.current_ns) for loop in loops],
     )
+
+
+def _knot(state: KeyframeState, keyframe: Odometry, base: Base, arm: Array) -> Knot:
+    """A keyframe of a trajectory of rows, whose `arm` is that of the last path.
+
+    The position of the camera is kept: the arm of an earlier path may differ.
+    """
+    return Knot(
+        camera_ns=keyframe.stamp_ns,
+        imu_ns=keyframe.imu_ns,
+        R=state.R,
+        position=base.camera(keyframe).position - state.R @ arm,
+        velocity=state.velocity,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        covariance=keyframe.pose_covariance,
+    )
+
+
+class PublishedStates:
+    """States between keyframes, as odometry_node publishes them on ``~/odometry``."""
+
+    def __init__(self, estimator: OdometryEstimator, rate: float) -> None:
+        """`rate` [Hz]: of the states; 0 for the keyframes alone."""
+        self._estimator = estimator
+        self._path = ContinuousPath(estimator.propagated)
+        self._step_ns = round(NANOSECONDS / rate) if rate else 0
+        self._next_ns = 0
+        self.published: list[Odometry] = []
+
+    def after(self, arrives_ns: int, keyframes: Sequence[Odometry]) -> None:
+        """Publish what is due after a sample, and the keyframes that it has finished."""
+        due = [self._estimator.newest_ns] if arrives_ns >= self._next_ns else []
+        if not self._step_ns:
+            due = [keyframe.imu_ns for keyframe in keyframes]
+        elif due:
+            self._next_ns = arrives_ns + self._step_ns
+        states = [self._path.at(imu_ns) for imu_ns in due]
+        self.published += [state for state in states if state is not None]
 
 
 def follow(
     estimator: OdometryEstimator,
     pairs: Iterable[tuple[int, KeyframePair]],
     samples: Sequence[tuple[int, ImuSample | int]],
+    after: Callable[[int, Sequence[Odometry]], None] = lambda arrives_ns, keyframes: None,
 ) -> list[Odometry]:
     """Keyframes of pairs and samples, both with their times of arrival [ns].
 
-    A number among the samples is the stamp of a frame.
+    A number among the samples is the stamp of a frame. `after`: called with the time of arrival
+    and the new keyframes after each pair and each sample.
     """
-    live, given = [], 0
+    live: list[Odometry] = []
+
+    def take(arrives_ns: int) -> None:
+        keyframes = estimator.take()
+        live.extend(keyframes)
+        after(arrives_ns, keyframes)
+
+    given = 0
     for arrives_ns, pair in pairs:
         while given < len(samples) and samples[given][0] <= arrives_ns:
             _add(estimator, samples[given][1])
+            take(samples[given][0])
             given += 1
         estimator.add_pair(pair)
-        live += estimator.take()
-    for _, sample in samples[given:]:
+        take(arrives_ns)
+    for sample_ns, sample in samples[given:]:
         if not estimator.waiting:
             break  # the rest of the IMU belongs to no pair
         _add(estimator, sample)
-        live += estimator.take()
+        take(sample_ns)
     return live + estimator.take(end=True)
 
 
@@ -247,14 +303,11 @@ def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]
     out: list[tuple[int, ImuSample | int]] = []
     for role, message in sensor_messages(bag, topics, (Role.IMU, Role.ACCEL, Role.CAMERA_INFO)):
         with suppress(InputError):  # the replay counts and reports it
-            out.append(
-                (
-                    message.bag_time_ns,
-                    stamp_ns(message.message.header)
-                    if role is Role.CAMERA_INFO
-                    else PARTS[role].read(message.message),
-                )
-            )
+            if role is Role.CAMERA_INFO:
+                value: ImuSample | int = stamp_ns(message.message.header)
+            else:
+                value = PARTS[role].read(message.message)
+            out.append((message.bag_time_ns, value))
     return out
 
 
@@ -266,8 +319,77 @@ def _add(estimator: OdometryEstimator, sample: ImuSample | int) -> None:
             estimator.add_imu(sample)
 
 
-# Path length of relative errors [m].
+# Path length over which relative errors are taken [m], as in docs/lab/odometry.md.
+# [chosen: a longer one averages over errors, of a shorter one the noise of the truth counts]
 _SEGMENT = 1.0
+# Fewest poses that are aligned with the truth: three positions fit any rotation.
+_FEWEST_ALIGNED = 4
+# Share of states within the bound that `beyond` counts.
+_WITHIN = 0.997
+
+
+def chi_squared_bound(dimension: int, share: float) -> float:
+    """The quantile of chi squared; scipy.stats takes a second to import."""
+    return float(2.0 * gammaincinv(0.5 * dimension, share))
+
+
+def write_states(path: Path, states: Iterable[Odometry]) -> None:
+    """Write states of the camera (CSV): `_STATE_COLUMNS`, every number exactly."""
+    with written(path) as file:
+        file.write(','.join(_STATE_COLUMNS) + '\n')
+        for state in states:
+            values = np.concatenate(
+                [
+                    state.position,
+                    quat_xyzw(state.R),
+                    state.R @ state.velocity,
+                    state.pose_covariance.ravel(),
+                ]
+            )
+            stamps = f'{state.stamp_ns},{state.imu_ns},{state.path},'
+            file.write(stamps + ','.join(map(repr, values.tolist())) + '\n')
+
+
+def consistency(
+    states: Sequence[Odometry], origin: Odometry, truth: TrueTrajectory
+) -> dict[str, dict[str, float] | None]:
+    """`nees` and `beyond` of published states, for summary.json; None where no truth covers them.
+
+    NEES: squared error by its covariance per degree of freedom, in the mean; 1 is wanted.
+    `beyond`: share outside of the 99.7 % quantile. `origin`: the first smoothed state, whose
+    position and heading are the origin of the world. All are states of the camera.
+    """
+    covered = [state for state in states if truth.covers(state.imu_ns)]
+    if not covered or not truth.covers(origin.imu_ns):
+        return {'nees': None, 'beyond': None}
+    turn = exp_so3(heading(origin.R @ truth.rotation(origin.imu_ns).T))
+    squares = np.array([_squared_errors(state, origin, turn, truth) for state in covered])
+    names = ('position', 'rotation', 'velocity')
+    beyond = (squares > chi_squared_bound(3, _WITHIN)).mean(axis=0)
+    return {
+        'nees': dict(zip(names, (squares.mean(axis=0) / 3.0).tolist(), strict=True)),
+        'beyond': dict(zip(names, beyond.tolist(), strict=True)),
+    }
+
+
+def _squared_errors(
+    state: Odometry, origin: Odometry, turn: Array, truth: TrueTrajectory
+) -> tuple[float, float, float]:
+    """Chi squared of position, rotation and velocity; `turn`: from the truth's world to ours."""
+    R = turn @ truth.rotation(state.imu_ns)
+    way = truth.position(state.imu_ns) - truth.position(origin.imu_ns)
+    velocity = R.T @ turn @ truth.velocity(state.imu_ns)
+    pose, twist = state.pose_covariance, state.velocity_covariance
+    position_error = state.position - origin.position - turn @ way
+    return (
+        _chi_squared(position_error, pose[:3, :3]),
+        _chi_squared(log_so3(state.R @ R.T), pose[3:, 3:]),
+        _chi_squared(state.velocity - velocity, twist[:3, :3]),
+    )
+
+
+def _chi_squared(error: Array, covariance: Array) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,65 +424,68 @@ def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
     patterns*, PAMI 13(4), 1991.
     """
     mean, true_mean = positions.mean(axis=0), truth.mean(axis=0)
-    a, b = positions - mean, truth - true_mean
-    correlation = b.T @ a
+    centred = positions - mean
+    correlation = (truth - true_mean).T @ centred
     R = aligning_rotation(correlation)
-    return R, true_mean - R @ mean, float((R * correlation).sum() / (a**2).sum())
+    scale = float((R * correlation).sum() / (centred**2).sum())
+    return R, true_mean - R @ mean, scale
 
 
 def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> ComparedPath:
     """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
     covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
-    if truth is None or len(covered) < 4:
-        return ComparedPath(
-            [pose.imu_ns for pose in trajectory],
-            np.array([pose.position for pose in trajectory]).reshape(-1, 3),
-        )
+    if truth is None or len(covered) < _FEWEST_ALIGNED:
+        positions = np.array([pose.position for pose in trajectory]).reshape(-1, 3)
+        return ComparedPath([pose.imu_ns for pose in trajectory], positions)
     positions = np.array([pose.position for pose in covered])
     true = np.array([truth.position(pose.imu_ns) for pose in covered])
     R, t, scale = aligned(positions, true)
     moved = positions @ R.T + t
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
-    relative = []
-    for i, pose in enumerate(covered):
-        j = int(np.searchsorted(way, way[i] + _SEGMENT))
-        if j == len(covered):
-            break
-        known = truth.relative_pose(pose.imu_ns, covered[j].imu_ns)
-        if known is not None and covered[j].path == pose.path:
-            step = pose.R.T @ (covered[j].position - pose.position)
-            relative.append(float(np.linalg.norm(step - known[1])) / float(way[j] - way[i]))
-    return ComparedPath(
-        [pose.imu_ns for pose in covered],
-        moved,
-        true,
-        TrajectoryErrors(
-            float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())),
-            scale - 1.0,
-            100.0 * float(np.median(relative)) if relative else math.nan,
-            float(way[-1]),
-        ),
+    steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    relative = _relative_errors(covered, way, truth)
+    errors = TrajectoryErrors(
+        ate_m=float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())),
+        scale_error=scale - 1.0,
+        relative_translation_error_percent=100.0 * float(np.median(relative or [math.nan])),
+        length_m=float(way[-1]),
     )
+    return ComparedPath([pose.imu_ns for pose in covered], moved, true, errors)
+
+
+def _relative_errors(poses: Sequence[Odometry], way: Array, truth: TrueTrajectory) -> list[float]:
+    """Errors of the translation over segments of 1 m, by their length; `way` (N,) [m]: true."""
+    relative = []
+    for i, pose in enumerate(poses):
+        j = int(np.searchsorted(way, way[i] + _SEGMENT))
+        if j == len(poses):
+            break
+        known = truth.relative_pose(pose.imu_ns, poses[j].imu_ns)
+        if known is not None and poses[j].path == pose.path:
+            step = pose.R.T @ (poses[j].position - pose.position)
+            error = float(np.linalg.norm(step - known[1]))
+            relative.append(error / float(way[j] - way[i]))
+    return relative
 
 
 def draw_paths(drawn: Mapping[str, ComparedPath], path: Path) -> Figure:
     """Paths by name, from above and their heights, with the ground truth if known."""
     picture = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
     above, height = picture.subplots(1, 2)
-    # Live paths begin later: the ground truth of the longer path.
-    lines = [
-        ('truth', line.imu_ns, line.truth)
-        for line in sorted(drawn.values(), key=lambda line: -len(line.imu_ns))
-        if line.truth is not None
-    ][:1]
+    # Live paths begin later: the ground truth of the longest path is drawn.
+    compared = [line for line in drawn.values() if line.truth is not None]
+    longest = max(compared, key=lambda line: len(line.imu_ns), default=None)
+    lines = [] if longest is None else [('truth', longest.imu_ns, longest.truth)]
     lines += [
         (name, line.imu_ns, line.positions) for name, line in drawn.items() if len(line.imu_ns)
     ]
     first_ns = min((imu_ns[0] for _, imu_ns, _ in lines), default=0)
     for name, imu_ns, positions in lines:
+        assert positions is not None
+        x, y, z = positions.T
         seconds = [seconds_between(first_ns, at_ns) for at_ns in imu_ns]
-        above.plot(positions[:, 0], positions[:, 1], label=name, **_STYLES[name])
-        height.plot(seconds, positions[:, 2], label=name, **_STYLES[name])
+        above.plot(x, y, label=name, **_STYLES[name])
+        height.plot(seconds, z, label=name, **_STYLES[name])
     above.set_aspect('equal', 'datalim')
     above.set(title='path from above', xlabel='x [m]', ylabel='y [m]')
     height.set(title='height', xlabel='time [s]', ylabel='z [m]')

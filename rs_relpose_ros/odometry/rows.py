@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 import zipfile
 
 import numpy as np
@@ -27,15 +27,19 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuInterval, ImuSamples
 from rs_relpose_ros.imu.integration import force_integrals
 from rs_relpose_ros.messages.outgoing import quat_xyzw
-from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.output_files import written
 
 ROWS_FILE = 'trajectory_rows.npz'
 
 Stamps = NDArray[np.int64]
 
-CAMERA, IMU, BASE = FRAMES = ('camera', 'imu', 'base')
+CAMERA = 'camera'
+IMU = 'imu'
+BASE = 'base'
+FRAMES = (CAMERA, IMU, BASE)
 _GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])
+# Columns of the samples of a trajectory, in the order of `RowTrajectory`.
+_Columns = tuple[Stamps, Array, Array, Array, Array]
 
 
 class Knot(NamedTuple):
@@ -127,23 +131,15 @@ class RowTrajectory(ArrayFile):
         """From the keyframes of consecutive paths and the samples of the IMU, at least two."""
         spans: list[tuple[int, int]] = []
         knots: list[Knot] = []
-        parts = []
+        parts: list[_Columns] = []
         for path in paths:
             # A path that continues one whose end was wrong begins at its end.
             later = [knot for knot in path if not spans or knot.imu_ns >= spans[-1][1]]
-            steps = [
-                (one, two, samples.between(one.imu_ns, two.imu_ns)) for one, two in pairwise(later)
-            ]
-            pieces = [
-                _between(one, two, interval)
-                for one, two, interval in steps
-                if interval is not None
-            ]
-            if len(pieces) < max(len(steps), 1):
-                continue  # too short, or its samples are not there
+            pieces = _pieces(later, samples)
+            if not pieces:
+                continue
             spans.append((later[0].imu_ns, later[-1].imu_ns))
-            parts += [tuple(column[:-1] for column in piece) for piece in pieces]
-            parts.append(tuple(column[-1:] for column in pieces[-1]))
+            parts += pieces
             knots += later
         if not spans:
             raise InputError(
@@ -172,7 +168,8 @@ class RowTrajectory(ArrayFile):
         """Whether there are poses at these times."""
         times = np.asarray(t_ns)
         k = np.searchsorted(self.spans[:, 0], times, side='right') - 1
-        return np.asarray((k >= 0) & (times <= self.spans[k, 1]))
+        last = self.spans[k, 1]
+        return np.asarray((k >= 0) & (times <= last))
 
     def pose(self, t_ns: ArrayLike, frame: str = CAMERA) -> tuple[Array, Array]:
         """R (..., 3, 3) from a frame to the world, and its position (..., 3) [m].
@@ -182,27 +179,35 @@ class RowTrajectory(ArrayFile):
         InputError
             A time is outside of `spans`, or the frame is not known.
         """
-        _, _, R, p, _, _ = self._at(t_ns, frame)
-        return R, p
+        mount = self._mount(frame)
+        R, position, _, _ = self._imu_at(self._covered(t_ns))
+        return R @ mount[:, :3], position + R @ mount[:, 3]
 
     def velocity(self, t_ns: ArrayLike, frame: str = CAMERA) -> tuple[Array, Array]:
         """Linear [m/s] and angular velocity [rad/s] (..., 3), in the axes of the frame itself."""
-        mount, _, R, _, velocity, rate = self._at(t_ns, frame)
-        moved = np.einsum('...ji,...j->...i', R, velocity)
-        return moved + np.cross(rate, mount[:, 3]) @ mount[:, :3], rate @ mount[:, :3]
+        mount = self._mount(frame)
+        R, _, velocity, rate = self._imu_at(self._covered(t_ns))
+        axes, arm = mount[:, :3], mount[:, 3]
+        moved = np.einsum('...ji,...j->...i', R @ axes, velocity)
+        return moved + np.cross(rate, arm) @ axes, rate @ axes
 
     def covariance(self, t_ns: ArrayLike, frame: str = CAMERA) -> Array:
         """Covariance (..., 6, 6) of position [m] and rotation [rad], in the axes of the world.
 
-        That of the keyframes, linear in between. The mounting is taken as exact.
+        It is that of the keyframes, linear in between. The mounting is taken as exact.
         """
-        mount, times, R, _, _, _ = self._at(t_ns, frame)
+        mount = self._mount(frame)
+        times = self._covered(t_ns)
         knots = self.keyframes_ns[:, 1]
-        k = np.clip(np.searchsorted(knots, times, side='right') - 1, 0, len(knots) - 2)
-        share = ((times - knots[k]) / np.maximum(knots[k + 1] - knots[k], 1))[..., None, None]
+        k = np.searchsorted(knots, times, side='right') - 1
+        k = np.clip(k, 0, len(knots) - 2)
+        step = np.maximum(knots[k + 1] - knots[k], 1)
+        share = ((times - knots[k]) / step)[..., None, None]
         covariance = (1.0 - share) * self.covariances[k] + share * self.covariances[k + 1]
-        # Off the base the position also changes with the rotation.
-        arm = R @ mount[:, :3].T @ (mount[:, 3] - self.mounts[FRAMES.index(BASE), :, 3])
+        # The position of a frame beside the base also changes with the rotation of the base.
+        R, _, _, _ = self._imu_at(times)
+        beside = mount[:, 3] - self.mounts[FRAMES.index(BASE), :, 3]
+        arm = R @ beside
         by = np.broadcast_to(np.eye(6), covariance.shape).copy()
         by[..., :3, 3:] = -np.cross(np.eye(3), arm[..., None, :])
         return np.asarray(by @ covariance @ np.swapaxes(by, -1, -2))
@@ -213,117 +218,139 @@ class RowTrajectory(ArrayFile):
         times = np.asarray(t_ns)
         return times - np.rint(np.interp(times, self.keyframes_ns[:, 1], offsets)).astype(np.int64)
 
-    def _at(self, t_ns: ArrayLike, frame: str) -> tuple[Array, Stamps, Array, Array, Array, Array]:
-        """Mount, times, R and p of a frame; velocity in the world and rate of the IMU."""
+    def _mount(self, frame: str) -> Array:
+        """R and p (3, 4) of a frame on the IMU."""
         validate.choice('frame', frame, FRAMES)
-        times, mount = np.asarray(t_ns), self.mounts[FRAMES.index(frame)]
+        return np.asarray(self.mounts[FRAMES.index(frame)])
+
+    def _covered(self, t_ns: ArrayLike) -> Stamps:
+        """Times as an array; InputError if one of them has no pose."""
+        times = np.asarray(t_ns)
         if not np.issubdtype(times.dtype, np.integer):
             raise InputError(f't_ns must be integers [ns], got {times.dtype}')
-        if not (known := self.covers(times)).all():
+        known = self.covers(times)
+        if not known.all():
             spans = ', '.join(f'{first} to {last}' for first, last in self.spans)
             raise InputError(
                 f'there is no pose at {int(times[~known].flat[0])} ns: the '
                 f'trajectory extends from {spans} ns on the clock of the IMU'
             )
+        return times
+
+    def _imu_at(self, times: Stamps) -> tuple[Array, Array, Array, Array]:
+        """The IMU at times (...): R, position and velocity in the world; rate in its own axes."""
+        shape = times.shape
         if not times.size:  # SciPy 1.11 has no empty rotations
-            nothing = np.zeros((*times.shape, 3))
-            return mount, times, np.zeros((*times.shape, 3, 3)), nothing, nothing, nothing
-        k = np.clip(
-            np.searchsorted(self.stamps_ns, times, side='right') - 1, 0, len(self.stamps_ns) - 2
-        )
-        step = np.maximum(self.stamps_ns[k + 1] - self.stamps_ns[k], 1)[..., None] / NANOSECONDS
-        s = (times - self.stamps_ns[k])[..., None] / NANOSECONDS / step
-        # Between samples: cubic polynomials with values and derivatives of both.
-        first, shape = Rotation.from_quat(self.quats_xyzw[k].reshape(-1, 4)), times.shape
-        turn = (
-            (first.inv() * Rotation.from_quat(self.quats_xyzw[k + 1].reshape(-1, 4)))
-            .as_rotvec()
-            .reshape(*shape, 3)
-        )
-        rate1, rate2, v1, v2 = (
-            values[i] for values in (self.rates, self.velocities) for i in (k, k + 1)
-        )
-        turned = _cubic(s, step, turn, rate1, rate2)
-        R = (first * Rotation.from_rotvec(turned.reshape(-1, 3))).as_matrix().reshape(*shape, 3, 3)
-        p = self.positions[k] + _cubic(s, step, self.positions[k + 1] - self.positions[k], v1, v2)
+            nothing = np.zeros((*shape, 3))
+            return np.zeros((*shape, 3, 3)), nothing, nothing, nothing
+        k = np.searchsorted(self.stamps_ns, times, side='right') - 1
+        k = np.clip(k, 0, len(self.stamps_ns) - 2)
+        begin, end = self.stamps_ns[k], self.stamps_ns[k + 1]
+        step = np.maximum(end - begin, 1)[..., None] / NANOSECONDS
+        share = (times - begin)[..., None] / NANOSECONDS / step
+        rate1, rate2 = self.rates[k], self.rates[k + 1]
+        velocity1, velocity2 = self.velocities[k], self.velocities[k + 1]
+        # Between samples rotation and position are cubic polynomials with the values and the
+        # derivatives of both samples.
+        first = Rotation.from_quat(self.quats_xyzw[k].reshape(-1, 4))
+        second = Rotation.from_quat(self.quats_xyzw[k + 1].reshape(-1, 4))
+        turn = (first.inv() * second).as_rotvec().reshape(*shape, 3)
+        turned = _cubic(share, step, turn, rate1, rate2).reshape(-1, 3)
+        R = (first * Rotation.from_rotvec(turned)).as_matrix().reshape(*shape, 3, 3)
+        way = self.positions[k + 1] - self.positions[k]
+        moved = _cubic(share, step, way, velocity1, velocity2)
         return (
-            mount,
-            times,
-            R @ mount[:, :3],
-            p + R @ mount[:, 3],
-            v1 + s * (v2 - v1),
-            rate1 + s * (rate2 - rate1),
+            R,
+            self.positions[k] + moved,
+            velocity1 + share * (velocity2 - velocity1),
+            rate1 + share * (rate2 - rate1),
         )
 
 
 def _cubic(s: Array, step: Array, way: Array, slope1: Array, slope2: Array) -> Array:
     """The cubic polynomial from 0 to `way` at s = 0 to 1 with these slopes, per `step` [s]."""
-    rest1, rest2 = step * slope1 - way, step * slope2 - way
-    return np.asarray(s * way + s * (1.0 - s) * ((1.0 - s) * rest1 - s * rest2))
+    rest1 = step * slope1 - way
+    rest2 = step * slope2 - way
+    bend = (1.0 - s) * rest1 - s * rest2
+    return np.asarray(s * way + s * (1.0 - s) * bend)
 
 
-def _between(one: Knot, two: Knot, interval: ImuInterval) -> tuple[Any, ...]:
+def _pieces(path: Sequence[Knot], samples: ImuSamples) -> list[_Columns]:
+    """Columns of the samples of a path; none if it is too short, or samples are missing."""
+    pieces = []
+    for one, two in pairwise(path):
+        interval = samples.between(one.imu_ns, two.imu_ns)
+        if interval is None:
+            return []
+        pieces.append(_between(one, two, interval))
+    if not pieces:
+        return []
+    # A keyframe is the last sample of one piece and the first one of the next: it counts once.
+    parts = [_cut(piece, slice(None, -1)) for piece in pieces]
+    return [*parts, _cut(pieces[-1], slice(-1, None))]
+
+
+def _cut(columns: _Columns, part: slice) -> _Columns:
+    """Some rows of all columns."""
+    stamps, quats, positions, velocities, rates = columns
+    return stamps[part], quats[part], positions[part], velocities[part], rates[part]
+
+
+def _between(one: Knot, two: Knot, interval: ImuInterval) -> _Columns:
     """Columns of the samples from one keyframe up to the next one."""
-    seconds, rates, forces = interval
-    rates, duration = rates - one.gyro_bias, interval.duration
-    s = (seconds / duration)[:, None]
-    by_gyro = Rotation.from_matrix(
-        one.R @ integrated_rotations(seconds, np.ascontiguousarray(rates))
-    )
+    seconds = interval.seconds[:, None]
+    duration = interval.duration
+    share = seconds / duration
+    rates = interval.rates - one.gyro_bias
+    turns = integrated_rotations(interval.seconds, np.ascontiguousarray(rates))
+    by_gyro = Rotation.from_matrix(one.R @ turns)
+    # The error of the rotation at the second keyframe is spread as a constant rate.
     error = log_so3(by_gyro[-1].as_matrix().T @ two.R)
-    closing = Rotation.from_rotvec(s * error)
+    closing = Rotation.from_rotvec(share * error)
     R = by_gyro * closing
-    once, twice = force_integrals(np.diff(seconds), R.apply(forces - one.accel_bias))
-    at = seconds[:, None]
-    velocity = one.velocity + once + at * _GRAVITY
-    position = one.position + at * one.velocity + twice + 0.5 * at**2 * _GRAVITY
-    way, change = two.position - position[-1], duration * (two.velocity - velocity[-1])
-    position = position + s**2 * (3.0 * way - change + s * (change - 2.0 * way))
-    velocity = (
-        velocity + s * (6.0 * way - 2.0 * change + 3.0 * s * (change - 2.0 * way)) / duration
-    )
-    stamps = one.imu_ns + np.rint(NANOSECONDS * seconds).astype(np.int64)
-    return (stamps, R.as_quat(), position, velocity, closing.inv().apply(rates) + error / duration)
+    forces = R.apply(interval.forces - one.accel_bias)
+    once, twice = force_integrals(np.diff(interval.seconds), forces)
+    velocity = one.velocity + once + seconds * _GRAVITY
+    position = one.position + seconds * one.velocity + twice + 0.5 * seconds**2 * _GRAVITY
+    # The errors of position and velocity there are spread as a cubic polynomial.
+    way = two.position - position[-1]
+    change = duration * (two.velocity - velocity[-1])
+    bend = change - 2.0 * way
+    position = position + share**2 * (3.0 * way - change + share * bend)
+    slope = 6.0 * way - 2.0 * change + 3.0 * share * bend
+    velocity = velocity + share * slope / duration
+    stamps = one.imu_ns + np.rint(NANOSECONDS * interval.seconds).astype(np.int64)
+    rates = closing.inv().apply(rates) + error / duration
+    return stamps, R.as_quat(), position, velocity, rates
 
 
 # -- files of poses ---------------------------------------------------------------------------
 
 
-class StampedPose(NamedTuple):
-    """The camera in the world."""
-
-    stamp_ns: int  # on the clock of the camera
-    R: Array
-    position: Array
+# A time on the clock of the camera [ns], with rotation and position of the camera in the world.
+StampedPose = tuple[int, Array, Array]
 
 
 def camera_poses(rows: RowTrajectory, rate: float) -> list[StampedPose]:
     """Poses of the camera at a rate [Hz], from the begin of each span; 0: at the keyframes."""
-    times = (
-        rows.keyframes_ns[:, 1]
-        if not rate
-        else np.concatenate(
+    times = rows.keyframes_ns[:, 1]
+    if rate:
+        step = NANOSECONDS / rate
+        times = np.concatenate(
             [
-                first
-                + np.rint(np.arange(0.0, last - first + 1.0, NANOSECONDS / rate)).astype(np.int64)
+                first + np.rint(np.arange(0.0, last - first + 1.0, step)).astype(np.int64)
                 for first, last in rows.spans
             ]
         )
-    )
     times = times[rows.covers(times)]
-    return [
-        StampedPose(int(stamp_ns), *pose)
-        for stamp_ns, *pose in zip(rows.camera_ns(times), *rows.pose(times), strict=True)
-    ]
+    R, positions = rows.pose(times)
+    return list(zip(rows.camera_ns(times).tolist(), R, positions, strict=True))
 
 
-def write_tum(path: Path, trajectory: Sequence[Odometry | StampedPose]) -> None:
+def write_tum(path: Path, poses: Iterable[StampedPose]) -> None:
     """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
     with written(path) as file:
-        for pose in trajectory:
-            values = [*pose.position, *quat_xyzw(pose.R)]
-            file.write(
-                f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
-                + ' '.join(f'{value:.9f}' for value in values)
-                + '\n'
-            )
+        for stamp_ns, R, position in poses:
+            seconds, rest = divmod(stamp_ns, NANOSECONDS)
+            numbers = ' '.join(f'{value:.9f}' for value in (*position, *quat_xyzw(R)))
+            file.write(f'{seconds}.{rest:09d} {numbers}\n')

@@ -15,12 +15,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.geometry.timing import seconds_between
 
-# A larger step back of the stamps is a clock that was set back.
+# A larger step back of the stamps is a clock that was set back; a smaller one is a state that was
+# requested twice. [chosen: 0.2 to 10 s would do: queries are at most a sample apart]
 _JUMP_NS = 1_000_000_000
-# Time constant in which corrections are blended in [s].
+# Time constant in which corrections are blended in [s]. A shorter one makes steps, which a
+# controller follows; a longer one publishes states that are known to be off for longer.
+# [chosen: 0.1 to 1 s would do; with 0.3 s the largest step is 0.15 sigma, docs/lab/odometry.md]
 _BLENDING = 0.3
 
 
@@ -52,15 +55,27 @@ class Base(NamedTuple):
     @classmethod
     def of(cls, frame_id: str, base_to_camera: Sequence[float]) -> Base:
         """From x y z, quaternion x y z w of the camera in the base."""
-        return cls(
-            frame_id,
-            Rotation.from_quat(base_to_camera[3:]).as_matrix(),
-            np.array(base_to_camera[:3]),
-        )
+        R = Rotation.from_quat(base_to_camera[3:]).as_matrix()
+        return cls(frame_id, R, np.array(base_to_camera[:3]))
 
-    def camera(self, pose: Odometry) -> Odometry:
-        """The pose of the camera instead of that of the base; the rest is unchanged."""
-        return replace(pose, R=pose.R @ self.R, position=pose.position + pose.R @ self.position)
+    def camera(self, base: Odometry) -> Odometry:
+        """The state of the camera instead of that of the base, with its covariances."""
+        arm = base.R @ self.position
+        by_pose = np.eye(6)
+        by_pose[:3, 3:] = -skew(arm)
+        by_twist = np.zeros((6, 6))
+        by_twist[:3, :3] = by_twist[3:, 3:] = self.R.T
+        by_twist[:3, 3:] = -self.R.T @ skew(self.position)
+        swing = np.cross(base.angular_velocity, self.position)
+        return replace(
+            base,
+            R=base.R @ self.R,
+            position=base.position + arm,
+            pose_covariance=by_pose @ base.pose_covariance @ by_pose.T,
+            velocity=self.R.T @ (base.velocity + swing),
+            angular_velocity=self.R.T @ base.angular_velocity,
+            velocity_covariance=by_twist @ base.velocity_covariance @ by_twist.T,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,18 +131,9 @@ class ContinuousPath:
         if last is None or last.path != state.path or imu_ns < last.imu_ns:
             self._offset = np.zeros(6)
         else:
-            seconds = seconds_between(last.imu_ns, imu_ns)
             if state.corrections != last.corrections:
-                before = self._propagated(last.imu_ns)
-                if before is None:  # the newest keyframe is later: back at the mean velocity
-                    way = 0.5 * seconds * (last.R @ last.velocity + state.R @ state.velocity)
-                    turn = 0.5 * seconds * (last.angular_velocity + state.angular_velocity)
-                    before = replace(
-                        state, position=state.position - way, R=state.R @ exp_so3(-turn)
-                    )
-                self._offset = np.concatenate(
-                    [last.position - before.position, log_so3(last.R @ before.R.T)]
-                )
+                self._offset = self._corrected_by(last, state)
+            seconds = seconds_between(last.imu_ns, imu_ns)
             self._offset = self._offset * math.exp(-seconds / _BLENDING)
         self._last = replace(
             state,
@@ -136,3 +142,16 @@ class ContinuousPath:
             pose_covariance=state.pose_covariance + np.outer(self._offset, self._offset),
         )
         return self._last
+
+    def _corrected_by(self, last: Odometry, state: Odometry) -> Array:
+        """Offset (6,) of the last published state from the path as it is known now."""
+        before = self._propagated(last.imu_ns)
+        if before is not None:
+            R, position = before.R, before.position
+        else:  # the newest keyframe is later: back at the mean velocity
+            seconds = seconds_between(last.imu_ns, state.imu_ns)
+            velocity = last.R @ last.velocity + state.R @ state.velocity
+            rate = last.angular_velocity + state.angular_velocity
+            position = state.position - 0.5 * seconds * velocity
+            R = state.R @ exp_so3(-0.5 * seconds * rate)
+        return np.concatenate([last.position - position, log_so3(last.R @ R.T)])

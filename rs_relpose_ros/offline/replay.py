@@ -111,6 +111,7 @@ class Replay:
         keep_images: bool = False,
     ) -> None:
         need_sensor_parameters(parameters)
+        self.parameters = parameters
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
         self.sequencer = self._front_end.sequencer

@@ -73,6 +73,10 @@ class TrueTrajectory:
         """Position (3,) [m] at a time that the poses cover."""
         return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS))
 
+    def velocity(self, at_ns: int) -> Array:
+        """Velocity (3,) [m/s] in the world, likewise."""
+        return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS, 1))
+
     def rotation(self, at_ns: int) -> Array:
         """R (3, 3) from the camera to the world, likewise."""
         return np.asarray(self._rotation((at_ns - self._stamps[0]) / NANOSECONDS).as_matrix())
