@@ -202,7 +202,8 @@ MAY_IMPORT_IN_THE_LABORATORY = {
     'simulation': set(),
     'live': {'simulation'},
     'experiments': {'simulation', 'live'},
-    'cli': {'simulation', 'live', 'experiments'},
+    'field': {'simulation', 'experiments'},
+    'cli': {'simulation', 'live', 'experiments', 'field'},
 }
 FREE_OF_ROS = (
     'geometry',

@@ -440,6 +440,26 @@ def _run_consistency(args: argparse.Namespace) -> int:
 
 
 @_benchmark(
+    'field',
+    'situations that users report (clocks that step, cropped images, repeated frames, vibration '
+    '...), rebuilt from simulated recordings: check, calibrate, replay and odometry on each, and '
+    'the verdict from the truth',
+    Argument(
+        '--only', {'nargs': '+', 'default': ['all'], 'metavar': 'ID', 'help': 'some of them'}
+    ),
+    _JOBS,
+)
+def _run_field(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.field.cases import BY_NAME
+    from rs_relpose_lab.field.run import report, run_case, Task
+
+    chosen = matching_cells(args.only, BY_NAME)
+    args.output.mkdir(parents=True, exist_ok=True)
+    tasks = [Task(BY_NAME[name], args.output) for name in chosen]
+    return _report_of(tasks, run_case, report, args, 'case')
+
+
+@_benchmark(
     'global-shutter',
     "images derotated to their middle row: against a renderer's truth, OpenCV's 5-point on raw "
     'and derotated images, processor time of a frame',

@@ -1,0 +1,83 @@
+"""Run the situations and report them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+import shutil
+import time
+from typing import NamedTuple
+
+from rs_relpose_lab.experiments.harness import markdown_table, write_table
+from rs_relpose_lab.field.cases import BASES, Case
+from rs_relpose_lab.field.recording import base_recording, write_recording
+from rs_relpose_lab.field.verdict import answers, judge, pose_distances, run_command, Verdict
+
+
+class Task(NamedTuple):
+    """A case and the folder of all cases."""
+
+    case: Case
+    output: Path
+
+
+def run_case(task: Task) -> Verdict:
+    """Make the recording of a case, run the commands on it, and judge their answers."""
+    case, output = task
+    base = base_recording(BASES[case.base], output / 'bases' / case.base)
+    recording = case.change(base)
+    folder = (output / 'cases' / case.name).resolve()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    bag = folder / 'bag'
+    parameters = write_recording(recording, bag)
+    started = time.monotonic()
+    found = answers(case, folder, bag, parameters)
+    seconds = time.monotonic() - started
+    for name, answer in found.items():
+        text = f'exit code {answer.code}\n{answer.text}'
+        (folder / f'{name}.txt').write_text(text, encoding='utf-8')
+    undisturbed = _undisturbed_poses(case, output) if case.solvable else None
+    verdict = judge(case, recording, folder, found, undisturbed, seconds)
+    # Bags are large, and they can be made again.
+    shutil.rmtree(bag, ignore_errors=True)
+    return verdict
+
+
+def _undisturbed_poses(case: Case, output: Path) -> int:
+    """Number of poses of the base recording, replayed once."""
+    folder = (output / 'bases' / case.base).resolve()
+    base = base_recording(BASES[case.base], folder)
+    replayed = folder / 'replay'
+    if not (replayed / 'summary.json').exists():
+        words = ('replay', str(folder / 'bag'), '--params', str(folder / 'bag.yaml'))
+        run_command(folder, *words, '--out', str(replayed), '--bag', '--no-pictures')
+    return len(pose_distances(base, folder)[0])
+
+
+def report(output: Path, verdicts: Sequence[Verdict]) -> str:
+    """Write the table of verdicts, and return it."""
+    header = (
+        *('case', 'verdict', 'poses of pairs', 'beyond', 'worst', 'calibrate', 'odometry beyond'),
+        *('named', 'reason'),
+    )
+    rows = [
+        (
+            one.case,
+            one.verdict,
+            f'{one.poses} of {one.pairs}',
+            f'{100.0 * one.beyond:.1f} %',
+            f'{one.worst:.1f}',
+            f'{one.calibration:.1f}',
+            f'{100.0 * one.states_beyond:.0f} %',
+            one.named[:24],
+            one.reason,
+        )
+        for one in verdicts
+    ]
+    count = {
+        kind: sum(one.verdict == kind for one in verdicts) for kind in ('good', 'poor', 'failure')
+    }
+    summary = ', '.join(f'{number} {kind}' for kind, number in count.items())
+    text = f'{markdown_table(header, rows)}\n{len(verdicts)} cases: {summary}\n'
+    return write_table(output, 'field', verdicts, text)
