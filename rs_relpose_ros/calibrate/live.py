@@ -24,10 +24,13 @@ from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
 # Length of the recording [s]: of the first fit; kept at most; added before the next fit.
-_FIRST, _LONGEST, _STEP = 7.0, 60.0, 1.0
+_FIRST = 7.0
+_LONGEST = 60.0
+_STEP = 1.0
 # Values with wider sigmas suffice, as their doubt is in the covariances: factors of the limits,
 # and of those where the doubt moves poses by less than their own sigma.
-_WIDER, _UNNOTICED = 2.0, 3.0
+_WIDER = 2.0
+_UNNOTICED = 3.0
 # From this length [s] on the rotation of a transform suffices: wheels turn about one axis only.
 _WHEELS = 20.0
 # Images that wait to be tracked; more are left out.
@@ -56,8 +59,10 @@ class LiveCalibration:
     def __init__(
         self, parameters: Parameters, *, use_stored: bool, waits_for: str = '', topic: str = ''
     ) -> None:
-        self._parameters, self._topic = parameters, topic
-        self._use_stored, self.waits_for = use_stored, waits_for
+        self._parameters = parameters
+        self._topic = topic
+        self._use_stored = use_stored
+        self.waits_for = waits_for
         self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
         # Images put into the queue by `receive`, or not, and taken by `step`: a thread each.
@@ -143,7 +148,8 @@ class LiveCalibration:
 
     def _use_clock_of(self, message: Any) -> None:
         """Go on with a clock that was set back, as by a bag that is looped, or begin again."""
-        recorder, self._refused = self._recorder, 0
+        recorder = self._recorder
+        self._refused = 0
         if not recorder.seconds or stamp_ns(message.header) > recorder.last_ns:
             self._restart()
             return
@@ -173,7 +179,8 @@ class LiveCalibration:
 
     def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
         """The stored calibration of the camera, if there is one, or the error of its file."""
-        config, size = self._parameters.calibration, self._recorder.size
+        config = self._parameters.calibration
+        size = self._recorder.size
         self._camera = (
             CameraId(config.camera_name, *size)
             if config.camera_name
@@ -203,7 +210,8 @@ class LiveCalibration:
         if fits is not None and fits.recording is not None:
             if not fits.found.done():
                 return None
-            recording, fits.recording = fits.recording, None
+            recording = fits.recording
+            fits.recording = None
             return self._evaluated(fits.found.result(), recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
@@ -277,7 +285,8 @@ class _Fits:
         self.found = self._thread.submit(self._answer, (recording, *others))
 
     def _answer(self, arguments: tuple[Any, ...]) -> CalibrationResult | RsRelposeError:
-        requests, answers = self.process.stdin, self.process.stdout
+        requests = self.process.stdin
+        answers = self.process.stdout
         assert requests is not None and answers is not None
         try:
             pickle.dump(arguments, requests, protocol=5)  # without copies of the arrays

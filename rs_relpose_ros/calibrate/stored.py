@@ -107,7 +107,8 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     InputError if the file is damaged, or of another camera or image size.
     """
     try:
-        own, values = file_values(path, _SECTION), file_values(path)
+        own = file_values(path, _SECTION)
+        values = file_values(path)
         read_parameters(path)  # a name or value that was edited by hand may be illegal
     except OSError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error

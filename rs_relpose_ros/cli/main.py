@@ -70,7 +70,9 @@ LABORATORY = (
     'the package rs_relpose_lab, which is not installed: '
     '"pip install \'rs_relpose_ros[lab]\'", or in a checkout "pip install ./rs_relpose_lab"'
 )
-DONE, FAILED, BAD_INPUT = 0, 1, 2
+DONE = 0
+FAILED = 1
+BAD_INPUT = 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 

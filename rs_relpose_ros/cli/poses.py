@@ -75,7 +75,8 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _print_replay(outcome: replay.ReplayOutcome) -> None:
     metrics = outcome.metrics
-    pairs, frames = metrics['pairs'], metrics['frames']
+    pairs = metrics['pairs']
+    frames = metrics['frames']
     refused = sum(frames['refused'].values()) + frames['failed']
     print(
         f'{frames["processed"]} of {frames["in_bag"]} images processed'

@@ -163,7 +163,7 @@ class RollingShutterCamera:
 
     def unproject_with_jacobian(self, points: ArrayLike) -> tuple[Array, Array]:
         """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
-        normalized, by_distorted = self._undistorted(points)
+        normalized, by_distorted = self._undistorted(self._distorted(points))
         return rays_with_jacobian(normalized, by_distorted / (self.fx, self.fy))
 
     def points_by_lens(self, points: ArrayLike) -> ByLens:
@@ -172,7 +172,9 @@ class RollingShutterCamera:
         Derivatives by the pixel, by the lens (`geometry.lens.LENS_ENTRIES`), and by both. A pixel
         outside the region where the distortion can be inverted gives NaN.
         """
-        return points_by_lens(*self._undistorted(points), (self.fx, self.fy), self._compiled)
+        distorted = self._distorted(points)
+        undistorted = self._undistorted(distorted)
+        return points_by_lens(distorted, *undistorted, (self.fx, self.fy), self._compiled)
 
     def rays_by_lens(self, points: ArrayLike) -> ByLens:
         """Unit rays of raw pixels (N, 2), with the derivatives of `points_by_lens`."""
@@ -191,14 +193,15 @@ class RollingShutterCamera:
             distortion=self._lens.moved(self.distortion, deviation[2:-2]),
         )
 
-    def _undistorted(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Undistorted normalised points of raw pixels, and derivatives by the distorted points."""
-        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-        distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+    def _distorted(self, points: ArrayLike) -> Array:
+        """Normalised points (N, 2) of raw pixels (N, 2), before the distortion is removed."""
+        pixels = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+        return (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+
+    def _undistorted(self, distorted: Array) -> tuple[Array, Array]:
+        """Undistorted points (N, 2), and their derivatives (N, 2, 2) by the distorted points."""
         if self.is_undistorted:
-            by_distorted = np.empty((len(points), 2, 2))
-            by_distorted[:] = np.eye(2)
-            return distorted, by_distorted
+            return distorted, np.tile(np.eye(2), (len(distorted), 1, 1))
         return undistort_points(distorted, self._lens.first_guess(distorted), self._compiled)
 
     @property

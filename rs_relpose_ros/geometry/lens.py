@@ -23,20 +23,19 @@ import numpy as np
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import dot
-from rs_relpose_ros.jit import kernel, KernelInterface
+from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
 
 # -- Deviations of a lens -------------------------------------------------------------------------
 
 # Entries of a deviation of the lens (true minus assumed) and their sizes, in the order of all
 # derivatives by the lens: logarithm of both focal lengths; logarithm of fy / fx, which moves fy;
-# radial coefficients k1, k2, k3; principal point cx, cy [px].
+# radial coefficients k1, k2, k3; principal point cx, cy [px]. [derived: the order of all
+# deviations in core.deviations]
 LENS_ENTRIES = (('focal_log', 1), ('aspect', 1), ('distortion', 3), ('principal_point', 2))
 # Number of values of a deviation of the lens. [derived: sum of the sizes above]
 N_LENS = 7
 # Number of the radial coefficients that have derivatives. [derived: size of 'distortion']
 _N_RADIAL = 3
-# First index of the radial coefficients. [derived: sizes of the entries before them]
-_DISTORTION = 2
 
 
 class ByLens(NamedTuple):
@@ -54,9 +53,12 @@ class ByLens(NamedTuple):
 
 # -- Distortion models by name --------------------------------------------------------------------
 
-# Values that the kernel of a profile writes: R, 2 R' and 4 R'', where the derivatives are by the
-# squared radius s; then G and 2 G' of each of k1, k2, k3, where G = dR/dk. [derived: 3 + 2 * 3]
-_PROFILE = 3 + 2 * _N_RADIAL
+# Number of values that the kernel of a profile writes: R, 2 R' and 4 R'', where the derivatives
+# are by the squared radius s; then G and 2 G' of each of k1, k2, k3, where G = dR/dk.
+# [derived: 3 + 2 * 3]
+_PROFILE = 9
+# Index of the first G. [derived: the values before it]
+_GAIN = 3
 
 
 @kernel
@@ -84,11 +86,11 @@ def fisheye_profile(s: float, k: Array, out: Array) -> None:
     by_theta_slope = (bend * theta / r - 2.0 * by_theta) / (wider * wider)
     out[2] = (by_theta_slope - 3.0 * out[1]) / s
     power = theta * t2  # theta^(2 m + 1) of coefficient m
-    for m in range(3):
+    for m in range(_N_RADIAL):
         gain = power / r
         by_theta = (2 * m + 3) * power / theta
-        out[3 + 2 * m] = gain
-        out[4 + 2 * m] = (by_theta / wider - gain) / s
+        out[_GAIN + 2 * m] = gain
+        out[_GAIN + 1 + 2 * m] = (by_theta / wider - gain) / s
         power *= t2
 
 
@@ -117,12 +119,12 @@ def rational_profile(s: float, k: Array, out: Array) -> None:
     out[1] = 2.0 * slope
     out[2] = 4.0 * bend
     power = 1.0  # s^m of coefficient m - 1
-    for m in range(3):
+    for m in range(_N_RADIAL):
         before = power
         power *= s
         gain = power / below
-        out[3 + 2 * m] = gain
-        out[4 + 2 * m] = 2.0 * ((m + 1) * before - gain * below_slope) / below
+        out[_GAIN + 2 * m] = gain
+        out[_GAIN + 1 + 2 * m] = 2.0 * ((m + 1) * before - gain * below_slope) / below
 
 
 # In compiled code: profile_at(address, s, k, out).
@@ -156,7 +158,8 @@ class DistortionModel:
         """Make the lens with these coefficients; the coefficients that are not given are zero."""
         given = np.zeros(12)
         given[: len(coefficients)] = coefficients
-        radial, sideways = np.zeros(6), np.zeros(6)
+        radial = np.zeros(6)
+        sideways = np.zeros(6)
         radial[: len(self.radial)] = given[list(self.radial)]
         sideways[: len(self.sideways)] = given[list(self.sideways)]
         return Lens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
@@ -213,9 +216,14 @@ def distort(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
     """Write D(x, y) and d D / d(x, y), row by row, into `out` (6,); `profile` (9,) is filled."""
     r2 = x * x + y * y
     profile_at(lens.profile, r2, lens.radial, profile)
-    radial, slope = profile[0], profile[1]
-    p1, p2 = lens.sideways[0], lens.sideways[1]
-    s1, s2, s3, s4 = lens.sideways[2], lens.sideways[3], lens.sideways[4], lens.sideways[5]
+    radial = profile[0]
+    slope = profile[1]
+    p1 = lens.sideways[0]
+    p2 = lens.sideways[1]
+    s1 = lens.sideways[2]
+    s2 = lens.sideways[3]
+    s3 = lens.sideways[4]
+    s4 = lens.sideways[5]
     out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2)
     out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4)
     prism_x = s1 + 2.0 * r2 * s2
@@ -231,14 +239,19 @@ def distort(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
 def project_points(points: Array, lens: Lens) -> Array:
     """Distorted normalised points (N, 2) of points (N, 3); NaN behind the camera."""
     out = np.empty((points.shape[0], 2))
-    profile, values = np.empty(_PROFILE), np.empty(6)
+    profile = np.empty(_PROFILE)
+    values = np.empty(6)
     for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         if z > _NEAREST:
             distort(x / z, y / z, lens, profile, values)
-            out[i, 0], out[i, 1] = values[0], values[1]
+            out[i, 0] = values[0]
+            out[i, 1] = values[1]
         else:
-            out[i, 0], out[i, 1] = math.nan, math.nan
+            out[i, 0] = math.nan
+            out[i, 1] = math.nan
     return out
 
 
@@ -250,13 +263,18 @@ def undistort_points(points: Array, first_guesses: Array, lens: Lens) -> tuple[A
     and not an inverse.
     """
     n = points.shape[0]
-    out, inverse = np.empty((n, 2)), np.empty((n, 2, 2))
-    profile, v = np.empty(_PROFILE), np.empty(6)
+    out = np.empty((n, 2))
+    inverse = np.empty((n, 2, 2))
+    profile = np.empty(_PROFILE)
+    v = np.empty(6)
     for i in range(n):
-        x, y, converged = first_guesses[i, 0], first_guesses[i, 1], False
+        x = first_guesses[i, 0]
+        y = first_guesses[i, 1]
+        converged = False
         for _ in range(50):
             distort(x, y, lens, profile, v)
-            error_x, error_y = points[i, 0] - v[0], points[i, 1] - v[1]
+            error_x = points[i, 0] - v[0]
+            error_y = points[i, 1] - v[1]
             determinant = v[2] * v[5] - v[3] * v[4]
             dx = (v[5] * error_x - v[3] * error_y) / determinant
             dy = (v[2] * error_y - v[4] * error_x) / determinant
@@ -264,8 +282,10 @@ def undistort_points(points: Array, first_guesses: Array, lens: Lens) -> tuple[A
             # A step may not leave the region in which the model is monotonic.
             limit = 0.5 * (1.0 + math.sqrt(x * x + y * y))
             if length > limit:
-                dx, dy = dx * limit / length, dy * limit / length
-            x, y = x + dx, y + dy
+                dx = dx * limit / length
+                dy = dy * limit / length
+            x = x + dx
+            y = y + dy
             # The error after a step is about its square: 1e-9 px at any focal length.
             if length < 1e-8 * (1.0 + limit):
                 converged = True
@@ -273,10 +293,15 @@ def undistort_points(points: Array, first_guesses: Array, lens: Lens) -> tuple[A
         distort(x, y, lens, profile, v)
         determinant = v[2] * v[5] - v[3] * v[4]
         if not (converged and determinant > 0.0):
-            x, y, determinant = math.nan, math.nan, math.nan
-        out[i, 0], out[i, 1] = x, y
-        inverse[i, 0, 0], inverse[i, 0, 1] = v[5] / determinant, -v[3] / determinant
-        inverse[i, 1, 0], inverse[i, 1, 1] = -v[4] / determinant, v[2] / determinant
+            x = math.nan
+            y = math.nan
+            determinant = math.nan
+        out[i, 0] = x
+        out[i, 1] = y
+        inverse[i, 0, 0] = v[5] / determinant
+        inverse[i, 0, 1] = -v[3] / determinant
+        inverse[i, 1, 0] = -v[4] / determinant
+        inverse[i, 1, 1] = v[2] / determinant
     return out, inverse
 
 
@@ -286,15 +311,21 @@ def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array
 
     `by_pixel` (N, 2, M): derivatives of the points by the variables of the result's last axis.
     """
-    n, variables = normalized.shape[0], by_pixel.shape[2]
-    rays, jacobian = np.empty((n, 3)), np.empty((n, 3, variables))
+    n = normalized.shape[0]
+    variables = by_pixel.shape[2]
+    rays = np.empty((n, 3))
+    jacobian = np.empty((n, 3, variables))
     for i in range(n):
-        x, y = normalized[i, 0], normalized[i, 1]
+        x = normalized[i, 0]
+        y = normalized[i, 1]
         scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
-        rays[i, 0], rays[i, 1], rays[i, 2] = x * scale, y * scale, scale
+        rays[i, 0] = x * scale
+        rays[i, 1] = y * scale
+        rays[i, 2] = scale
         for k in range(variables):
             # m = n / |n| with n = (x, y, 1): dm = (dn - m (m . dn)) / |n|.
-            dx, dy = by_pixel[i, 0, k], by_pixel[i, 1, k]
+            dx = by_pixel[i, 0, k]
+            dy = by_pixel[i, 1, k]
             along = rays[i, 0] * dx + rays[i, 1] * dy
             jacobian[i, 0, k] = (dx - rays[i, 0] * along) * scale
             jacobian[i, 1, k] = (dy - rays[i, 1] * along) * scale
@@ -320,25 +351,33 @@ def project_rotating(
     settled = 0.01  # largest distance of the assumed row from the projected one [px]
     most_rounds = 12
     fx, fy, cx, cy = intrinsics
-    out, rotated = np.empty((len(rays), 2)), np.empty(3)
-    profile, values = np.empty(_PROFILE), np.empty(6)
+    out = np.empty((len(rays), 2))
+    rotated = np.empty(3)
+    profile = np.empty(_PROFILE)
+    values = np.empty(6)
     per_row = (len(rotations) - 1) / max(height - 1.0, 1.0)
     for n in range(len(rays)):
-        row, before, ahead, slope = rows[n], rows[n], 0.0, 0.0
+        row = rows[n]
+        before = rows[n]
+        ahead = 0.0
+        slope = 0.0
         u = v = math.nan
         for step in range(most_rounds):
             place = row * per_row
             i = int(min(max(place, 0.0), len(rotations) - 2.0))
             share = place - i
             for j in range(3):
-                first, second = dot(rotations[i, j], rays[n]), dot(rotations[i + 1, j], rays[n])
+                first = dot(rotations[i, j], rays[n])
+                second = dot(rotations[i + 1, j], rays[n])
                 rotated[j] = first + share * (second - first)
             if not rotated[2] > _NEAREST:
                 u = v = math.nan
                 break
-            x, y = rotated[0] / rotated[2], rotated[1] / rotated[2]
+            x = rotated[0] / rotated[2]
+            y = rotated[1] / rotated[2]
             distort(x, y, lens, profile, values)
-            u, v = cx + fx * values[0], cy + fy * values[1]
+            u = cx + fx * values[0]
+            v = cy + fy * values[1]
             if abs(v - row) < settled:
                 break
             if step == most_rounds - 1:
@@ -348,9 +387,11 @@ def project_rotating(
                 slope = (v - ahead) / (row - before)
             if not abs(slope) < 0.9:
                 slope = 0.0
-            before, ahead = row, v
+            before = row
+            ahead = v
             row += (v - row) / (1.0 - slope)
-        out[n, 0], out[n, 1] = u, v
+        out[n, 0] = u
+        out[n, 1] = v
     return out
 
 
@@ -360,125 +401,123 @@ def project_rotating(
 @kernel
 def _bends(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
     """Write the second derivatives of D by (x, y) into `out` (2, 2, 2), component first."""
-    slope, bend = profile[1], profile[2]
-    p1, p2 = lens.sideways[0], lens.sideways[1]
-    s1, s2, s3, s4 = lens.sideways[2], lens.sideways[3], lens.sideways[4], lens.sideways[5]
+    slope = profile[1]
+    bend = profile[2]
+    p1 = lens.sideways[0]
+    p2 = lens.sideways[1]
     r2 = x * x + y * y
-    xxx = x * (3.0 * slope + bend * x * x)
-    xxy = y * (slope + bend * x * x)
-    xyy = x * (slope + bend * y * y)
-    yyy = y * (3.0 * slope + bend * y * y)
-    out[0, 0, 0] = xxx + 6.0 * p2 + 2.0 * s1 + s2 * (4.0 * r2 + 8.0 * x * x)
-    out[0, 0, 1] = out[0, 1, 0] = xxy + 2.0 * p1 + 8.0 * s2 * x * y
-    out[0, 1, 1] = xyy + 2.0 * p2 + 2.0 * s1 + s2 * (4.0 * r2 + 8.0 * y * y)
-    out[1, 0, 0] = xxy + 2.0 * p1 + 2.0 * s3 + s4 * (4.0 * r2 + 8.0 * x * x)
-    out[1, 0, 1] = out[1, 1, 0] = xyy + 2.0 * p2 + 8.0 * s4 * x * y
-    out[1, 1, 1] = yyy + 6.0 * p1 + 2.0 * s3 + s4 * (4.0 * r2 + 8.0 * y * y)
-
-
-@kernel
-def _pull(x: float, y: float, focal: tuple[float, float], profile: Array, out: Array) -> None:
-    """Write ``dd/dq - dD/dq`` by each value q of the lens into the rows of `out` (7, 2).
-
-    `out` has the order of `LENS_ENTRIES`, and holds the distorted point in its first row.
-    """
-    out[0, 0], out[0, 1] = -out[0, 0], -out[0, 1]
-    out[1, 0], out[1, 1] = 0.0, out[0, 1]
-    for m in range(_N_RADIAL):
-        gain = profile[3 + 2 * m]
-        out[_DISTORTION + m, 0], out[_DISTORTION + m, 1] = -gain * x, -gain * y
-    out[N_LENS - 2, 0], out[N_LENS - 2, 1] = -1.0 / focal[0], 0.0
-    out[N_LENS - 1, 0], out[N_LENS - 1, 1] = 0.0, -1.0 / focal[1]
-
-
-@kernel
-def _turn(
-    x: float, y: float, q: int, moved: Array, profile: Array, bends: Array, out: Array
-) -> None:
-    """Write dJ/dq into `out` (2, 2): through the point that moves, and through the coefficient.
-
-    `moved` (2,) is dn/dq, and `bends` (2, 2, 2) is as of `_bends`.
-    """
+    out[0, 0, 0] = x * (3.0 * slope + bend * x * x) + 6.0 * p2
+    out[0, 0, 1] = y * (slope + bend * x * x) + 2.0 * p1
+    out[0, 1, 1] = x * (slope + bend * y * y) + 2.0 * p2
+    out[1, 1, 1] = y * (3.0 * slope + bend * y * y) + 6.0 * p1
+    # The radial and the tangential parts do not depend on the order of the indices.
+    out[1, 0, 0] = out[0, 0, 1]
+    out[1, 0, 1] = out[0, 1, 1]
     for c in range(2):
-        for j in range(2):
-            out[c, j] = bends[c, j, 0] * moved[0] + bends[c, j, 1] * moved[1]
-    m = q - _DISTORTION
-    if 0 <= m < _N_RADIAL:
-        gain, slope = profile[3 + 2 * m], profile[4 + 2 * m]
-        out[0, 0] += gain + slope * x * x
-        out[0, 1] += slope * x * y
-        out[1, 0] += slope * x * y
-        out[1, 1] += gain + slope * y * y
+        square = 2.0 * lens.sideways[2 + 2 * c]
+        fourth = 4.0 * lens.sideways[3 + 2 * c]
+        out[c, 0, 0] += square + fourth * (r2 + 2.0 * x * x)
+        out[c, 0, 1] += 2.0 * fourth * x * y
+        out[c, 1, 1] += square + fourth * (r2 + 2.0 * y * y)
+        out[c, 1, 0] = out[c, 0, 1]
+
+
+@kernel
+def _write_both(
+    n: Array, A: Array, profile: Array, bends: Array, by_pixel: Array, by_lens: Array, out: Array
+) -> None:
+    """Write d2n / (du dq) of one point into `out` (2, 2, 7), as in `points_by_lens`."""
+    for c in range(2):
+        toward = A[c, 0] * n[0] + A[c, 1] * n[1]
+        for u in range(2):
+            P0 = by_pixel[0, u]
+            P1 = by_pixel[1, u]
+            # dJ/dq through the point that moves.
+            by_x = A[c, 0] * (bends[0, 0, 0] * P0 + bends[0, 0, 1] * P1)
+            by_x += A[c, 1] * (bends[1, 0, 0] * P0 + bends[1, 0, 1] * P1)
+            by_y = A[c, 0] * (bends[0, 1, 0] * P0 + bends[0, 1, 1] * P1)
+            by_y += A[c, 1] * (bends[1, 1, 0] * P0 + bends[1, 1, 1] * P1)
+            for q in range(N_LENS):
+                out[c, u, q] = -(by_x * by_lens[0, q] + by_y * by_lens[1, q])
+            # dJ/dq through the coefficient: G I + 2 G' n n^T.
+            even = A[c, 0] * P0 + A[c, 1] * P1
+            along = toward * (n[0] * P0 + n[1] * P1)
+            for m in range(_N_RADIAL):
+                gain = profile[_GAIN + 2 * m]
+                out[c, u, 2 + m] -= gain * even + profile[_GAIN + 1 + 2 * m] * along
+            # A longer focal length makes the step of a pixel smaller: A (d2d / (du dq)).
+            out[c, u, 0] -= by_pixel[c, u]
+            if u == 1:
+                out[c, u, 1] -= by_pixel[c, u]
 
 
 @kernel
 def points_by_lens(
-    points: Array, by_distorted: Array, focal: tuple[float, float], lens: Lens
+    distorted: Array, points: Array, by_distorted: Array, focal: tuple[float, float], lens: Lens
 ) -> ByLens:
-    """Derivatives of normalised points by the pixel and by the lens.
+    """Derivatives of normalised points n by the pixel and by the lens.
 
-    `points` (N, 2) are undistorted, `by_distorted` (N, 2, 2) are their derivatives A by the
-    distorted points d, both as of `undistort_points`; `focal` is (fx, fy) [px]. With J = dD/dn,
-    the equation ``D(n; k) = d`` holds for all pixels and lenses, so by a value q of the lens
+    `points` (N, 2) are undistorted, and `by_distorted` (N, 2, 2) are their derivatives A by the
+    distorted points d (N, 2), both as of `undistort_points`; `focal` is (fx, fy) [px]. With
+    J = dD/dn, the equation ``D(n) = d`` holds for all pixels and lenses, so by a value q of the
+    lens
 
         dn/dq = A (dd/dq - dD/dq)          d2n/(du dq) = -A (dJ/dq) dn/du + A (d2d / (du dq))
     """
-    n = points.shape[0]
-    by_pixel, by_lens = np.empty((n, 2, 2)), np.empty((n, 2, N_LENS))
-    by_both = np.empty((n, 2, 2, N_LENS))
-    profile, values, bends = np.empty(_PROFILE), np.empty(6), np.empty((2, 2, 2))
-    pull, moved, turn = np.empty((N_LENS, 2)), np.empty(2), np.empty((2, 2))
-    for i in range(n):
-        x, y, A, P = points[i, 0], points[i, 1], by_distorted[i], by_pixel[i]
-        distort(x, y, lens, profile, values)
+    count = len(points)
+    by_pixel = np.empty((count, 2, 2))
+    by_lens = np.empty((count, 2, N_LENS))
+    by_both = np.empty((count, 2, 2, N_LENS))
+    profile = np.empty(_PROFILE)
+    bends = np.empty((2, 2, 2))
+    for i in range(count):
+        x = points[i, 0]
+        y = points[i, 1]
+        A = by_distorted[i]
+        profile_at(lens.profile, x * x + y * y, lens.radial, profile)
         _bends(x, y, lens, profile, bends)
         for c in range(2):
-            P[c, 0], P[c, 1] = A[c, 0] / focal[0], A[c, 1] / focal[1]
-        pull[0, 0], pull[0, 1] = values[0], values[1]
-        _pull(x, y, focal, profile, pull)
-        for q in range(N_LENS):
-            for c in range(2):
-                moved[c] = A[c, 0] * pull[q, 0] + A[c, 1] * pull[q, 1]
-                by_lens[i, c, q] = moved[c]
-            _turn(x, y, q, moved, profile, bends, turn)
-            for j in range(2):
-                first = turn[0, 0] * P[0, j] + turn[0, 1] * P[1, j]
-                second = turn[1, 0] * P[0, j] + turn[1, 1] * P[1, j]
-                # A longer focal length makes the step of a pixel smaller: d2d / (du dq).
-                shrink = 1.0 if q == 0 or (q == 1 and j == 1) else 0.0
-                for c in range(2):
-                    by_both[i, c, j, q] = -(A[c, 0] * first + A[c, 1] * second) - shrink * P[c, j]
+            by_lens[i, c, 0] = -(A[c, 0] * distorted[i, 0] + A[c, 1] * distorted[i, 1])
+            by_lens[i, c, 1] = -A[c, 1] * distorted[i, 1]
+            for m in range(_N_RADIAL):
+                by_lens[i, c, 2 + m] = -profile[_GAIN + 2 * m] * (A[c, 0] * x + A[c, 1] * y)
+            for u in range(2):
+                by_pixel[i, c, u] = A[c, u] / focal[u]
+                by_lens[i, c, 2 + _N_RADIAL + u] = -by_pixel[i, c, u]
+        _write_both(points[i], A, profile, bends, by_pixel[i], by_lens[i], by_both[i])
     return ByLens(points, by_pixel, by_lens, by_both)
 
 
-@kernel
-def _dot(m: Array, n: Array) -> float:
-    """Product of the first two components: the change of a normalised point has no third one."""
-    return m[0] * n[0] + m[1] * n[1]
+@small_kernel
+def _dot(m: Array, dn: Array) -> float:
+    """``m . dn``, where the change dn of a normalised point has no third component."""
+    return m[0] * dn[0] + m[1] * dn[1]
 
 
 @kernel
 def rays_by_lens(points: ByLens) -> ByLens:
-    """Unit rays and their derivatives from normalised points and theirs.
+    """Unit rays and their derivatives, from normalised points and the derivatives of these.
 
     With ``m = n / |n|`` and ``h = 1 / |n|``: ``dm = h (dn - m (m . dn))``, and once more by q
 
-        d2m = h (d2n - m (m . d2n) - m_q (m . dn) - m (m_q . dn)) - h (m . dn_q) dm
+        d2m = h (d2n - m (m . d2n) - m_q (m . dn) - m (m_q . dn)) - h (m . n_q) dm
     """
     rays, by_pixel = rays_with_jacobian(points.values, points.by_pixel)
     _, by_lens = rays_with_jacobian(points.values, points.by_lens)
-    n = rays.shape[0]
-    by_both = np.empty((n, 3, 2, N_LENS))
-    for i in range(n):
-        scale = rays[i, 2]
+    by_both = np.empty((len(rays), 3, 2, N_LENS))
+    d2n = np.zeros(3)
+    for i in range(len(rays)):
+        m = rays[i]
         for q in range(N_LENS):
-            growth = _dot(rays[i], points.by_lens[i, :, q])
-            for j in range(2):
-                step, both = points.by_pixel[i, :, j], points.by_pixel_by_lens[i, :, j, q]
-                along, along_both = _dot(rays[i], step), _dot(rays[i], both)
-                turned = _dot(by_lens[i, :, q], step)
+            m_q = by_lens[i, :, q]
+            growth = _dot(m, points.by_lens[i, :, q])
+            for u in range(2):
+                dn = points.by_pixel[i, :, u]
+                d2n[0] = points.by_pixel_by_lens[i, 0, u, q]
+                d2n[1] = points.by_pixel_by_lens[i, 1, u, q]
+                along = _dot(m, dn)
+                along_by_lens = _dot(m, d2n) + _dot(m_q, dn)
                 for c in range(3):
-                    across = both[c] if c < 2 else 0.0
-                    across -= rays[i, c] * (along_both + turned) + by_lens[i, c, q] * along
-                    by_both[i, c, j, q] = scale * (across - growth * by_pixel[i, c, j])
+                    change = d2n[c] - m[c] * along_by_lens - m_q[c] * along
+                    by_both[i, c, u, q] = m[2] * (change - growth * by_pixel[i, c, u])
     return ByLens(rays, by_pixel, by_lens, by_both)

@@ -3,7 +3,7 @@
 Code outside of kernels uses SciPy's ``Rotation``. An argument of a small kernel is a tuple or an
 array (3,), such as the row ``rays[k]`` of an array of rays; a result is a tuple. Small kernels are
 inlined in their callers, without allocation. Every sum runs over x, y, z in this order, so that
-the bits are those of a sum that is written out.
+it has the same bits as a sum that is written out.
 """
 
 import math
@@ -15,7 +15,8 @@ from rs_relpose_ros.jit import kernel, small_kernel
 
 Vector = tuple[float, float, float]
 
-STANDARD_GRAVITY = 9.80665  # [m/s^2]
+# Standard acceleration of free fall [m/s^2]. [derived: ISO 80000-3]
+STANDARD_GRAVITY = 9.80665
 
 
 @small_kernel
@@ -44,20 +45,23 @@ def scale(factor: float, v: Vector | Array) -> Vector:
 
 @small_kernel
 def norm(v: Vector | Array) -> float:
-    """``|v|``; for vectors whose squares neither overflow nor vanish."""
+    """``|v|`` of a vector whose squares neither overflow nor vanish."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
 @small_kernel
 def copy_vector(source: Array, out: Array) -> None:
-    """``out[:] = source`` of (n,), of which Numba takes seconds to compile the error message."""
+    """``out[:] = source`` of (n,).
+
+    Numba would take seconds to compile the error message of the slice assignment.
+    """
     for i in range(len(source)):
         out[i] = source[i]
 
 
 @small_kernel
 def copy_matrix(source: Array, out: Array) -> None:
-    """``out[:] = source`` of (n, m)."""
+    """``out[:] = source`` of (n, m), for the same reason."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             out[i, j] = source[i, j]
@@ -65,7 +69,7 @@ def copy_matrix(source: Array, out: Array) -> None:
 
 @small_kernel
 def rotated(R: Array, v: Vector | Array) -> Vector:
-    """``R v``, of any matrix (3, 3)."""
+    """``R v`` with any matrix R (3, 3)."""
     return (
         R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
         R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
@@ -75,7 +79,7 @@ def rotated(R: Array, v: Vector | Array) -> Vector:
 
 @small_kernel
 def rotated_back(R: Array, v: Vector | Array) -> Vector:
-    """``R^T v``, of any matrix (3, 3)."""
+    """``R^T v`` with any matrix R (3, 3)."""
     return (
         R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
         R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
@@ -86,7 +90,8 @@ def rotated_back(R: Array, v: Vector | Array) -> Vector:
 @kernel
 def tangent_basis(t: Array) -> Array:
     """Two orthonormal columns (3, 2) perpendicular to the unit vector `t`."""
-    basis, axis = np.empty((3, 2)), np.zeros(3)
+    basis = np.empty((3, 2))
+    axis = np.zeros(3)
     # The axis least aligned with t keeps the cross product well conditioned.
     k = 0
     for i in (1, 2):
@@ -95,14 +100,16 @@ def tangent_basis(t: Array) -> Array:
     axis[k] = 1.0
     u = cross(t, axis)
     length = norm(u)
-    basis[0, 0], basis[1, 0], basis[2, 0] = u[0] / length, u[1] / length, u[2] / length
+    basis[0, 0] = u[0] / length
+    basis[1, 0] = u[1] / length
+    basis[2, 0] = u[2] / length
     basis[0, 1], basis[1, 1], basis[2, 1] = cross(t, basis[:, 0])
     return basis
 
 
 @small_kernel
 def rodrigues(theta2: float) -> tuple[float, float]:
-    """``sin(theta) / theta`` and ``(1 - cos(theta)) / theta^2`` of a squared angle [rad^2]."""
+    """``sin(theta) / theta`` and ``(1 - cos(theta)) / theta^2`` from theta squared [rad^2]."""
     if theta2 < 1e-8:
         return 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0
     theta = math.sqrt(theta2)
@@ -112,7 +119,9 @@ def rodrigues(theta2: float) -> tuple[float, float]:
 @kernel
 def _skew_series(v: Array, a: float, b: float) -> Array:
     """``I + a [v]x + b [v]x^2`` (3, 3)."""
-    x, y, z = v[0], v[1], v[2]
+    x = v[0]
+    y = v[1]
+    z = v[2]
     out = np.empty((3, 3))
     out[0, 0] = 1.0 - b * (y * y + z * z)
     out[1, 1] = 1.0 - b * (x * x + z * z)
@@ -136,7 +145,8 @@ def exp_so3(v: Array) -> Array:
 @kernel
 def log_so3(rotation: Array) -> Array:
     """Rotation vector (3,) [rad], of length at most pi, of a rotation matrix."""
-    # Through the quaternion: exact near 0 and near pi, where the trace formula loses digits.
+    # The way through the quaternion is exact near 0 and near pi, where the trace formula loses
+    # digits.
     q = np.empty(4)
     trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
     if trace > 0.0:
@@ -160,7 +170,7 @@ def log_so3(rotation: Array) -> Array:
         q[k] = (rotation[k, i] + rotation[i, k]) / s
     if q[3] < 0.0:
         q = -q
-    sine = norm(q)  # of x, y, z
+    sine = norm(q)  # `norm` takes the first three elements: x, y, z
     factor = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, q[3]) / sine
     vector = np.empty(3)
     for i in range(3):
@@ -182,7 +192,7 @@ def left_jacobian_so3(v: Array) -> Array:
 
 @kernel
 def multiply(A: Array, B: Array, out: Array) -> None:
-    """Write ``A B`` of two matrices (3, 3) into `out`; the matrices are too small for BLAS."""
+    """Write the product ``A B`` (3, 3) into `out`; the matrices are too small for BLAS."""
     for i in range(3):
         out[i, 0], out[i, 1], out[i, 2] = rotated_back(B, A[i])  # row of A B: B^T a_i
 
@@ -198,7 +208,7 @@ def heading(R: Array) -> Array:
 
 
 def by_axes(matrix: Array) -> Array:
-    """Kronecker product (3 n, 3 m) of a matrix (n, m) and the identity (3, 3)."""
+    """Kronecker product (3 n, 3 m) of a matrix (n, m) with the identity (3, 3)."""
     n, m = matrix.shape
     product = np.zeros((n, 3, m, 3))
     for axis in range(3):
@@ -209,26 +219,29 @@ def by_axes(matrix: Array) -> Array:
 def aligning_rotation(correlation: Array) -> Array:
     """Rotation R (3, 3) that minimises ``sum |a - R b|^2``, from ``sum a b^T`` (Wahba, Kabsch).
 
-    As SciPy's ``align_vectors``, without its warning if the rotation about one axis is arbitrary.
+    SciPy's ``align_vectors`` warns if the rotation about one axis is arbitrary.
     """
     u, _, vt = np.linalg.svd(correlation)
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
     return np.ascontiguousarray(u @ vt)
 
 
-# Order statistics: Numba's own sort takes seconds to compile.
+# Order statistics follow, because Numba's own sort takes seconds to compile.
 
 
 @kernel
 def smallest(values: Array, k: int) -> float:
     """Element k of `values` (n,) in ascending order, by Hoare's *Find* (Comm. ACM 4, 1961).
 
-    `values`, free of NaN, are reordered: none before index k is larger, none after it smaller.
+    `values`, which must not hold NaN, are reordered: no value before index k is larger than the
+    result, and no value after it is smaller.
     """
-    low, high = 0, len(values) - 1
+    low = 0
+    high = len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
-        i, j = low, high
+        i = low
+        j = high
         while i <= j:
             while values[i] < pivot:
                 i += 1
@@ -247,7 +260,7 @@ def smallest(values: Array, k: int) -> float:
 
 @kernel
 def median(values: Array) -> float:
-    """Median of at least one value; `values`, free of NaN, are reordered."""
+    """Median of at least one value; `values`, which must not hold NaN, are reordered."""
     n = len(values)
     upper = smallest(values, n // 2)
     return upper if n % 2 == 1 else 0.5 * (smallest(values, n // 2 - 1) + upper)
@@ -258,7 +271,7 @@ def median(values: Array) -> float:
 #     R_0 = I        R_{k+1} = R_k Exp(phi_k)
 #     phi_k = (w_k + w_{k+1}) dt / 2 + (w_k x w_{k+1}) dt^2 / 12
 #
-# Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
+# by the Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
 
 
 @small_kernel
@@ -273,7 +286,10 @@ def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:
 
 @kernel
 def integrated_rotations(seconds: Array, rates: Array) -> Array:
-    """``R_k`` (K, 3, 3), sample k to the first; increasing times (K,), rates (K, 3) [rad/s]."""
+    """``R_k`` (K, 3, 3) from sample k to the first one.
+
+    `seconds` (K,) are increasing times, `rates` (K, 3) the rates at these times [rad/s].
+    """
     rotations = np.empty((len(seconds), 3, 3))
     rotations[0] = 0.0
     rotations[0, 0, 0] = rotations[0, 1, 1] = rotations[0, 2, 2] = 1.0

@@ -65,7 +65,8 @@ def correlation_of_steps(steps: Array) -> float:
     deviations = np.clip(steps, low, high)
     deviations -= deviations[whole].mean()
     both = whole[1:] & whole[:-1]
-    first, second = deviations[:-1][both], deviations[1:][both]
+    first = deviations[:-1][both]
+    second = deviations[1:][both]
     return float(first @ second) / max(0.5 * float(first @ first + second @ second), 1e-24)
 
 
@@ -166,7 +167,8 @@ class FrameIntervals:
     def add(self, stamp_ns: int) -> int | None:
         """T of the frame of this stamp [ns]; None of the first one."""
         if self._stamp_ns is not None:
-            difference, kept = stamp_ns - self._stamp_ns, self._interval_ns
+            difference = stamp_ns - self._stamp_ns
+            kept = self._interval_ns
             if difference <= 0:
                 return kept
             # 2 d > 3 T and |d - d_before| > d / 10, in integers.

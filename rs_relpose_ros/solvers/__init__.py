@@ -1,4 +1,4 @@
-"""Minimal solvers: a function per row of the table, such as `uniform_9pt`."""
+"""Minimal solvers: one function for each row of the table, such as `uniform_9pt`."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING

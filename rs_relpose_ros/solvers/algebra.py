@@ -12,13 +12,14 @@ from rs_relpose_ros.jit import kernel, small_kernel
 
 @kernel
 def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
-    """LU factorisation of `A` (n, n) in place, with row pivoting; the determinant.
+    """Factor `A` (n, n) into L U in place, with row pivoting; returns the determinant.
 
-    The diagonal receives the reciprocals of the pivots. For inverse iteration, a pivot of exactly
-    zero is replaced by a tiny one; the determinant is then zero.
+    The diagonal receives the reciprocals of the pivots. A pivot of exactly zero is replaced by a
+    tiny one, so that inverse iteration works; the determinant is then zero.
     """
     n = A.shape[0]
-    determinant, largest = 1.0, 0.0
+    determinant = 1.0
+    largest = 0.0
     for i in range(n):
         for j in range(n):
             largest = max(largest, abs(A[i, j]))
@@ -48,7 +49,7 @@ def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
 
 @kernel
 def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
-    """Solve ``A x = b`` in place of `b` (n,), with the result of `lu_factor`."""
+    """Solve ``A x = b`` with the result of `lu_factor`; x replaces `b` (n,)."""
     n = LU.shape[0]
     for k in range(n):
         b[k], b[pivots[k]] = b[pivots[k]], b[k]
@@ -66,8 +67,9 @@ def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
 
 @kernel
 def normalise(v: Array) -> None:
-    """Scale `v` (n,) to unit length in place; NaN if it has none."""
-    largest, total = 0.0, 0.0
+    """Scale `v` (n,) to unit length in place; a vector of length zero becomes NaN."""
+    largest = 0.0
+    total = 0.0
     for k in range(len(v)):
         largest = max(largest, abs(v[k]))
     for k in range(len(v)):
@@ -82,20 +84,22 @@ def normalise(v: Array) -> None:
 def null_direction(rows: Array) -> tuple[Vector, float]:
     """Null vector of a matrix (3, 3) of rank 2, and its squared length.
 
-    The longest of the cross products of two rows; zero if all are parallel.
+    It is the longest of the cross products of two rows, and zero if all rows are parallel.
     """
-    best, longest = (0.0, 0.0, 0.0), 0.0
+    best = (0.0, 0.0, 0.0)
+    longest = 0.0
     for i in range(3):
         direction = cross(rows[i], rows[(i + 1) % 3])
         length2 = dot(direction, direction)
         if length2 > longest:
-            best, longest = direction, length2
+            best = direction
+            longest = length2
     return best, longest
 
 
 @kernel
 def cholesky(matrix: Array, factor: Array) -> bool:
-    """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
+    """Write the lower Cholesky factor of a symmetric matrix; False if there is none."""
     n = matrix.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -113,7 +117,7 @@ def cholesky(matrix: Array, factor: Array) -> bool:
 
 @kernel
 def newton_step(factor: Array, gradient: Array) -> Array:
-    """Solution of ``L L^T x = -gradient`` with the Cholesky factor L."""
+    """Solve ``L L^T x = -gradient`` with the Cholesky factor L."""
     n = gradient.shape[0]
     x = np.empty(n)
     for i in range(n):
@@ -130,18 +134,22 @@ def newton_step(factor: Array, gradient: Array) -> Array:
 
 
 # Real roots of polynomials. The roots of the derivative divide the line into intervals on which
-# the polynomial is monotonic, each with at most one root; applied from the linear derivative
-# upwards this isolates **all** real roots without a start value and without division by a leading
-# coefficient (Yuksel, *High-Performance Polynomial Root Finding for Graphics*, HPG 2022). The line
-# is covered as [-1, 1] and, with the coefficients reversed, its outside: values do not overflow.
+# the polynomial is monotonic, and each interval has at most one root. Applied from the linear
+# derivative upwards, this isolates **all** real roots without a start value and without division
+# by a leading coefficient (Yuksel, *High-Performance Polynomial Root Finding for Graphics*, HPG
+# 2022). The line is covered as [-1, 1] and, with the coefficients reversed, as its outside, so
+# that values do not overflow.
 
 # Largest distance from the unit circle of a pair of roots in exp(i psi) that counts as one angle.
+# A smaller value loses double roots that rounding has moved off the circle; a larger value costs
+# Newton's method on pairs that are no solution. [chosen: Newton's method decides, so any value
+# in 1e-4..1e-2 would do]
 PAIR_TOLERANCE = 1e-3
 
 
 @kernel
 def value(p: Array, x: float) -> float:
-    """Value at `x` of the polynomial with ascending coefficients `p`."""
+    """Evaluate the polynomial with ascending coefficients `p` at `x`."""
     y = 0.0
     for k in range(len(p) - 1, -1, -1):
         y = y * x + p[k]
@@ -150,10 +158,14 @@ def value(p: Array, x: float) -> float:
 
 @small_kernel
 def _root_between(p: Array, low: float, high: float, at_low: float, last_step: float) -> float:
-    """Root in a bracket with a monotonic polynomial: Newton's method, bisection outside of it."""
+    """Find the root of a polynomial that is monotonic between `low` and `high`.
+
+    Newton's method finds it; a step that would leave the bracket is replaced by a bisection.
+    """
     x = 0.5 * (low + high)
     for _ in range(80):  # bisection alone would need 52
-        y, slope = 0.0, 0.0
+        y = 0.0
+        slope = 0.0
         for k in range(len(p) - 1, -1, -1):
             slope = slope * x + y
             y = y * x + p[k]
@@ -175,13 +187,15 @@ def _root_between(p: Array, low: float, high: float, at_low: float, last_step: f
 
 @kernel
 def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array) -> int:
-    """All real roots in [-1, 1], ascending; their number, 0 when a coefficient is not finite.
+    """Find all real roots in [-1, 1], ascending; returns their number.
 
-    `p` (n + 1,): ascending coefficients, n >= 2. `roots`, `half_gaps` (n,): receive the roots, and
-    h of those that are a conjugate pair ``c +- ih`` (otherwise 0): its angle ``2 atan(zoom x)``
-    has an imaginary part ``2 zoom h / (1 + zoom^2 c^2)`` below PAIR_TOLERANCE.
+    `p` (n + 1,): ascending coefficients, n >= 2; if one is not finite there are no roots.
+    `roots` (n,) receives the roots. `half_gaps` (n,) receives 0, or h if a root c stands for a
+    conjugate pair ``c +- ih``. Such a pair counts if its angle ``2 atan(zoom x)`` has an imaginary
+    part ``2 zoom h / (1 + zoom^2 c^2)`` below PAIR_TOLERANCE.
     """
-    n, count = len(p) - 1, 0
+    n = len(p) - 1
+    count = 0
     # Row m: the derivative of degree m, ascending, divided by (n - m)!; row n is p itself.
     derivatives = np.zeros((n + 1, n + 1))
     copy_vector(p, derivatives[n])
@@ -190,37 +204,43 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
             derivatives[m, k] = derivatives[m + 1, k + 1] * ((k + 1) / (n - m))
     for m in range(1, n + 1):
         # Row m is monotonic between the roots of the previous one.
-        q, cuts, count = derivatives[m, : m + 1], roots[:count].copy(), 0
-        left, at_left = -1.0, value(q, -1.0)
+        q = derivatives[m, : m + 1]
+        cuts = roots[:count].copy()
+        count = 0
+        left = -1.0
+        at_left = value(q, -1.0)
         for k in range(len(cuts) + 1):
             right = cuts[k] if k < len(cuts) else 1.0
             at_right = value(q, right)
             if not (math.isfinite(at_left) and math.isfinite(at_right)):
                 return 0
             if (at_left > 0.0) != (at_right > 0.0):
-                # Exactly 0 counts as negative: a root at a cut is found once. A shorter step is
-                # the last one: Newton's iteration squares the error.
-                roots[count] = _root_between(q, left, right, at_left, 1e-8 if m == n else 1e-5)
+                # Exactly 0 counts as negative, so that a root at a cut is found once. As Newton's
+                # iteration squares the error, a step below this is the last one.
+                last_step = 1e-8 if m == n else 1e-5
+                roots[count] = _root_between(q, left, right, at_left, last_step)
                 half_gaps[count] = 0.0
                 count += 1
             elif m == n and k < len(cuts):
-                # An extremum c, if no root follows, which may nearly touch zero: near it,
-                # p(x) = p(c) + p''(c) (x - c)^2 / 2, row n - 2 being p'' / 2.
+                # The cut is an extremum c. If no root follows, it may nearly touch zero: near it,
+                # p(x) = p(c) + p''(c) (x - c)^2 / 2, and row n - 2 is p'' / 2.
                 following = value(q, cuts[k + 1] if k + 1 < len(cuts) else 1.0)
                 h2 = at_right / value(derivatives[n - 2, : n - 1], right)
                 limit = 0.5 * PAIR_TOLERANCE * (1.0 / zoom + zoom * right * right)
                 if (following > 0.0) == (at_right > 0.0) and 0.0 <= h2 < limit * limit:
-                    roots[count], half_gaps[count] = right, math.sqrt(h2)
+                    roots[count] = right
+                    half_gaps[count] = math.sqrt(h2)
                     count += 1
-            left, at_left = right, at_right
+            left = right
+            at_left = at_right
     return count
 
 
-# All zeros of a real trigonometric polynomial D(psi) of degree n. With ``x = tan(psi / 2) /
-# zoom``, ``exp(i psi) = (1 + i zoom x)^2 / (1 + zoom^2 x^2)``, hence ``(1 + zoom^2 x^2)^n D`` is a
-# polynomial of degree 2n in x, which 2n + 1 samples determine. A zoom below 1 concentrates the
-# samples around angle 0, so that zeros which cluster there within about `zoom`, where D is smaller
-# by orders of magnitude than on the rest of the circle, are resolved.
+# The functions below find all zeros of a real trigonometric polynomial D(psi) of degree n. With
+# ``x = tan(psi / 2) / zoom``, ``exp(i psi) = (1 + i zoom x)^2 / (1 + zoom^2 x^2)``, hence
+# ``(1 + zoom^2 x^2)^n D`` is a polynomial of degree 2n in x, which 2n + 1 samples determine. A
+# zoom below 1 concentrates the samples around angle 0. So it resolves zeros that cluster there
+# within about `zoom`, where D is smaller by orders of magnitude than on the rest of the circle.
 
 
 def half_angle_nodes(degree: int) -> Array:
@@ -244,17 +264,18 @@ def sample_angle(node: Array, zoom: float) -> tuple[float, float]:
     weight ``((1 + zoom^2 x^2) / (1 + x^2))^n`` transforms a trigonometric polynomial of degree n
     in the angle to one of the same degree in ``2 atan(x)``; it is returned for n = 1.
     """
-    c, s = node[0], zoom * node[1]
+    c = node[0]
+    s = zoom * node[1]
     return 2.0 * math.atan2(s, c), c * c + s * s
 
 
 @kernel
 def angles_of_zeros(p: Array, zoom: float, angles: Array, half_gaps: Array) -> int:
-    """All angles ``2 atan(zoom x)`` at which a polynomial is zero; their number.
+    """Find all angles ``2 atan(zoom x)`` at which a polynomial is zero; returns their number.
 
-    `p` (2n + 1,): ascending coefficients in x, overwritten. `angles`, `half_gaps` (2n,): receive
-    the angles [rad], and the distance of those that are a pair of roots in ``exp(i psi)`` within
-    PAIR_TOLERANCE of the unit circle (otherwise 0).
+    `p` (2n + 1,): ascending coefficients in x, overwritten. `angles` (2n,) receives the angles
+    [rad]. `half_gaps` (2n,) receives 0, or the distance from the unit circle of a pair of roots in
+    ``exp(i psi)`` that is closer to it than PAIR_TOLERANCE.
     """
     largest = 0.0
     for value in p:
@@ -263,9 +284,11 @@ def angles_of_zeros(p: Array, zoom: float, angles: Array, half_gaps: Array) -> i
         return 0
     p /= largest
     n = len(p) - 1
-    roots, gaps, count = np.empty(n), np.empty(n), 0
-    # |x| > 1: x = -1 / y, of which p(-1 / y) y^2n = 0. 2 atan(zoom x) = 2 atan(y / zoom) + pi, up
-    # to whole turns.
+    roots = np.empty(n)
+    gaps = np.empty(n)
+    count = 0
+    # Where |x| > 1, the substitution x = -1 / y gives p(-1 / y) y^2n = 0, and
+    # 2 atan(zoom x) = 2 atan(y / zoom) + pi up to whole turns.
     outside = p[::-1].copy()
     outside[1::2] *= -1.0
     for q, scale, offset in ((p, zoom, 0.0), (outside, 1.0 / zoom, math.pi)):

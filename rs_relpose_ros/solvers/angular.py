@@ -15,9 +15,10 @@ from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.common import Knowledge, Sample, Solutions
 
+# Most real solutions. [derived: degree of the polynomial in z]
 MAX_5PT = 10
 
-# Monomials, the cubic ones in Nister's order: the first ten are eliminated.
+# Cubic monomials in Nister's order: the first ten are eliminated. [derived: the paper]
 _CUBIC = [
     'xxx',
     'yyy',
@@ -40,7 +41,9 @@ _CUBIC = [
     'z11',
     '111',
 ]
+# Quadratic monomials, in any order. [chosen: any order would do]
 _QUADRATIC = ['xx', 'xy', 'xz', 'x1', 'yy', 'yz', 'y1', 'zz', 'z1', '11']
+# Linear monomials, in the order of the rows of the basis. [derived: E = x B_0 + ... + 1 B_3]
 _ORDER = 'xyz1'
 
 
@@ -51,7 +54,9 @@ def _product_table(left: list[str], products: list[str]) -> NDArray[np.int64]:
     )
 
 
+# Products of two linear polynomials, and of a quadratic with a linear one. [derived: the lists]
 _TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
+# The same of a quadratic monomial. [derived: the lists]
 _TO_CUBIC = _product_table(_QUADRATIC, _CUBIC)
 
 
@@ -67,12 +72,13 @@ def _reflect(unit: Array, vector: Array) -> None:
 
 @small_kernel
 def _null_space(rows: Array, basis: Array) -> None:
-    """Orthonormal basis (4, 9) of the null space of `rows` (5, 9), which are overwritten.
+    """Write an orthonormal basis (4, 9) of the null space of `rows` (5, 9), which are overwritten.
 
-    The last four columns of Q of the transposed matrix, by Householder reflections.
+    It is the last four columns of Q of the transposed matrix, by Householder reflections.
     """
     for k in range(5):
-        row, length2 = rows[k], 0.0
+        row = rows[k]
+        length2 = 0.0
         for i in range(9):
             row[i] = row[i] if i >= k else 0.0
             length2 += row[i] * row[i]
@@ -97,9 +103,10 @@ def _add_product(p: Array, q: Array, factor: float, table: NDArray[np.int64], ou
 
 @small_kernel
 def _cubic_constraints(basis: Array, M: Array) -> None:
-    """``det E = 0`` and ``(E E^T - trace(E E^T) / 2) E = 0`` in the 20 monomials: `M` (10, 20).
+    """Write ``det E = 0`` and ``(E E^T - trace(E E^T) / 2) E = 0`` into `M` (10, 20).
 
-    ``E = x B_0 + y B_1 + z B_2 + B_3`` with the four rows of `basis`.
+    The columns are the 20 cubic monomials of ``E = x B_0 + y B_1 + z B_2 + B_3``, where B_0 to
+    B_3 are the rows of `basis` (4, 9).
     """
     E = np.empty((9, 4))
     for c in range(4):
@@ -108,7 +115,8 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
     M[:] = 0.0
     minor = np.empty(10)
     for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         minor[:] = 0.0
         _add_product(E[3 + j], E[6 + k], 1.0, _TO_QUADRATIC, minor)
         _add_product(E[3 + k], E[6 + j], -1.0, _TO_QUADRATIC, minor)
@@ -131,18 +139,24 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
 
 @small_kernel
 def _reduced_constraints(basis: Array, reduced: Array) -> bool:
-    """The constraints, columns 10 to 19 after elimination of the first ten: `reduced` (10, 10).
+    """Eliminate the first ten monomials, and write the other ten columns into `reduced` (10, 10).
 
-    One row a column. Rounding is proportional to the largest coefficient: beyond 1e4 (1 to 2 % of
-    random problems, rarely in a second one) another `basis` (4, 9) is used.
+    Each row of `reduced` is a column. Rounding is proportional to the largest coefficient. If that
+    exceeds 1e4, as in 1 to 2 % of random problems, another `basis` (4, 9) is used, in which it
+    rarely does so again.
     """
-    M, left, pivots = np.empty((10, 20)), np.empty((10, 10)), np.empty(10, np.int64)
+    M = np.empty((10, 20))
+    left = np.empty((10, 10))
+    pivots = np.empty(10, np.int64)
     coefficient = math.inf
     for attempt in range(3):
         if attempt > 0:
             # A rotation by 60 degrees: the quaternion (1 + i + j + k) / 2 times (x, y, z, 1).
             for m in range(9):
-                a, b, c, d = basis[0, m], basis[1, m], basis[2, m], basis[3, m]
+                a = basis[0, m]
+                b = basis[1, m]
+                c = basis[2, m]
+                d = basis[3, m]
                 basis[0, m] = 0.5 * (a - b - c - d)
                 basis[1, m] = 0.5 * (a + b - c + d)
                 basis[2, m] = 0.5 * (a + b + c - d)
@@ -171,7 +185,7 @@ def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float, o
 
 @small_kernel
 def _degree_10(reduced: Array, B: Array, p: Array) -> None:
-    """The 3x3 matrix of polynomials in z, `B` (3, 3, 5), with ``B(z) (x, y, 1) = 0``; its det."""
+    """Write the polynomials in z ``B(z) (x, y, 1) = 0``, `B` (3, 3, 5), and det B, `p` (11,)."""
     B[:] = 0.0
     for r in range(3):
         # Row 4 + 2 r less z times the next one: the leading monomials cancel.
@@ -184,7 +198,8 @@ def _degree_10(reduced: Array, B: Array, p: Array) -> None:
     p[:] = 0.0
     minor = np.empty(7)
     for r in range(3):
-        i, j = (r + 1) % 3, (r + 2) % 3
+        i = (r + 1) % 3
+        j = (r + 2) % 3
         minor[:] = 0.0
         _multiply_add(B[i, 0], 4, B[j, 1], 4, 1.0, minor)
         _multiply_add(B[j, 0], 4, B[i, 1], 4, -1.0, minor)
@@ -193,7 +208,10 @@ def _degree_10(reduced: Array, B: Array, p: Array) -> None:
 
 @small_kernel
 def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
-    """E (3, 3) with ``|E| = sqrt(2)`` at a root z: (x, y, 1) is the null vector of B(z)."""
+    """Write E (3, 3) with ``|E| = sqrt(2)`` at a root z, where B(z) has the null vector (x, y, 1).
+
+    Returns False if E is not finite.
+    """
     V = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -214,53 +232,64 @@ def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
 
 @small_kernel
 def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
-    """R and t (in `x`) of ``E = [t]x R`` with most points in front of, or behind both cameras.
+    """Write R and t (into `x`) of ``E = [t]x R`` with most points on one side of both cameras.
 
-    Horn: ``(t.t) R = cofactors(E) -+ [t]x E``, for t and -t.
+    By Horn, ``(t.t) R = cofactors(E) -+ [t]x E``, for t and for -t. Returns False if E has no
+    translation.
     """
     t, length2 = algebra.null_direction(np.ascontiguousarray(E.T))
     scale = 1.0 / math.sqrt(length2)
     for i in range(3):
         x[i] = t[i] * scale
-    candidate, best = np.empty((3, 3)), -1
+    candidate = np.empty((3, 3))
+    best = -1
     for twist in (1.0, -1.0):
         for i in range(3):
-            i1, i2 = (i + 1) % 3, (i + 2) % 3
+            i1 = (i + 1) % 3
+            i2 = (i + 2) % 3
             for j in range(3):
-                j1, j2 = (j + 1) % 3, (j + 2) % 3
+                j1 = (j + 1) % 3
+                j2 = (j + 2) % 3
                 cofactor = E[i1, j1] * E[i2, j2] - E[i1, j2] * E[i2, j1]
                 t_cross_E = x[i1] * E[i2, j] - x[i2] * E[i1, j]
                 candidate[i, j] = cofactor - twist * t_cross_E
         votes = max(common.cheirality_votes(sample, candidate, x))
         if votes > best:
             best = votes
-            # Without rounding a rotation.
+            # The logarithm and the exponential remove the rounding.
             so3.copy_matrix(so3.exp_so3(so3.log_so3(candidate)), R)
     return length2 > 1e-20
 
 
 @kernel
 def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
-    """The calibrated 5-point problem: one decomposition of every real essential matrix.
+    """Solve the calibrated 5-point problem: one pose for each real essential matrix.
 
-    Of its four decompositions it is the one with most points in front of both cameras. For
-    derotated rays see section 'Angular 5-point algorithm' of the paper, and
-    `rs_relpose_ros.solvers.angular` for the method.
+    Of the four decompositions of a matrix, the pose is the one with most points in front of both
+    cameras. For derotated rays see section 'Angular 5-point algorithm' of the paper, and for the
+    method see `rs_relpose_ros.solvers.angular`.
     """
     rows = np.empty((5, 9))
     for k in range(5):
         for i in range(3):
             for j in range(3):
                 rows[k, 3 * i + j] = sample.f1[k, i] * sample.f2[k, j]  # f_1^T E f_2 = 0
-    basis, reduced = np.empty((4, 9)), np.empty((10, 10))
+    basis = np.empty((4, 9))
+    reduced = np.empty((10, 10))
     _null_space(rows, basis)
     if not _reduced_constraints(basis, reduced):
         return 0
-    B, p, angles, gaps = np.empty((3, 3, 5)), np.empty(11), np.empty(10), np.empty(10)
+    B = np.empty((3, 3, 5))
+    p = np.empty(11)
+    angles = np.empty(10)
+    gaps = np.empty(10)
     _degree_10(reduced, B, p)
     # A double root that rounding has made a conjugate pair counts; Newton's method decides.
     found = algebra.angles_of_zeros(p, 1.0, angles, gaps)
-    E, x, factors, axes = np.empty((3, 3)), np.zeros(9), common.row_time_factors(sample), np.eye(3)
+    E = np.empty((3, 3))
+    x = np.zeros(9)
+    factors = common.row_time_factors(sample)
+    axes = np.eye(3)
     count = 0
     for k in range(found):
         R = out.R[count]

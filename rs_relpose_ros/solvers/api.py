@@ -1,8 +1,8 @@
 """The table of minimal solvers, and its solvers as Python functions with checked arguments.
 
 All solve ``(f_1 x R f_2) . (t - tau_1 d_1 + tau_2 d_2) = 0`` (docs/conventions.md, equation 4),
-with ``d_1 = v_1`` and ``d_2 = R v_2``, and differ in the rays, in the velocities that they solve
-for and in the known part of R. To add a solver: write its kernel, and its row here.
+with ``d_1 = v_1`` and ``d_2 = R v_2``. They differ in the rays, in the velocities that they solve
+for, and in the known part of R. To add a solver, write its kernel and its row here.
 
 References
 ----------
@@ -84,7 +84,7 @@ SOLVERS = {
     )
 }
 
-# No solver of the public table: it does not estimate the rotation.
+# This solver is not in the public table, because it does not estimate the rotation.
 GYRO_2PT = Solver(
     'gyro_2pt',
     2,
@@ -117,7 +117,7 @@ class MinimalSolution:
     v2: Array
 
 
-# Behind the description of each solver.
+# End of the documentation of each solver.
 _ARGUMENTS = """
 
     Parameters
@@ -130,15 +130,15 @@ _ARGUMENTS = """
         Direction of free fall in each camera's frame at the reference row, of any length; used by
         `uniform_9pt`, `linear_9pt` and `angular_3pt`.
     start_rotations : (K, 3, 3) array_like
-        Rotations from which `uniform_11pt` starts: the gyro's prediction, or those of
+        Rotations from which `uniform_11pt` starts: the gyro's prediction, or the solutions of
         `angular_5pt`.
 
     Returns
     -------
     list of MinimalSolution
-        All real solutions; of `uniform_11pt` the distinct solutions that it reaches. Of
-        (t, v1, v2) and its negative, which solve the same equations, the one with more of the
-        points in front of both cameras, at the positions of the cameras at their rows.
+        All real solutions; `uniform_11pt` gives the distinct solutions that it reaches. Both
+        (t, v1, v2) and its negative solve the equations. The sign is that with more of the points
+        in front of both cameras, at the positions of the cameras at their rows.
 
     Raises
     ------
@@ -149,7 +149,7 @@ _ARGUMENTS = """
 
 
 def as_function(row: Solver) -> Callable[..., list[MinimalSolution]]:
-    """The solver of a row as a pure function."""
+    """Make a pure function of the solver of a row."""
     n = row.sample_size
 
     def solve(
@@ -205,5 +205,5 @@ def _alignment(name: str, gravity: ArrayLike | None) -> Array:
 def _solutions(row: Solver, sample: Sample, known: Knowledge) -> Iterator[MinimalSolution]:
     out = common.empty_solutions(row.most_solutions)
     for k in range(common.run_solver(row.address, sample, known, out)):
-        t, d1, d2 = out.x[k].reshape(3, 3)  # without velocities zero
+        t, d1, d2 = out.x[k].reshape(3, 3)  # d1 and d2 are zero without velocities
         yield MinimalSolution(out.R[k], t, d1, out.R[k].T @ d2)

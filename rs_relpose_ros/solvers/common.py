@@ -1,7 +1,7 @@
 """Common parts of the minimal solvers: signature, cheirality, gravity, columns of the model.
 
-A solver is a kernel that is called by its address: the robust loop is compiled once, and a solver
-only when it is used.
+A solver is a kernel that is called by its address. So the robust loop is compiled once, and a
+solver is compiled only when it is used.
 """
 
 from collections.abc import Callable
@@ -32,18 +32,19 @@ from rs_relpose_ros.solvers.algebra import cholesky, lu_factor, lu_solve, newton
 class Sample(NamedTuple):
     """A minimal sample of n matches."""
 
-    f1: Array  # (n, 3) unit rays in their camera's frame, derotated by the gyro if the model is
-    f2: Array  # likewise
-    tau1: Array  # (n,) row times [s] relative to the reference row
-    tau2: Array  # likewise
+    # (n, 3) unit rays in the frame of camera 1, derotated by the gyro if `Model.derotated`.
+    f1: Array
+    f2: Array  # (n, 3) the same in the frame of camera 2
+    tau1: Array  # (n,) row times in frame 1 [s], relative to the reference row
+    tau2: Array  # (n,) row times in frame 2 [s]
 
 
 class Knowledge(NamedTuple):
-    """Known quantities besides the matches; `Solver` has the ones that a solver uses."""
+    """What is known besides the matches; the flags of `Solver` say which of it a solver uses."""
 
-    align1: Array  # (3, 3) rotation of the camera's gravity onto +z (`gravity_alignment`)
-    align2: Array  # likewise
-    rotation: Array  # (3, 3) a predicted R, if `predicted`
+    align1: Array  # (3, 3) rotates gravity in camera 1 onto +z (`gravity_alignment`)
+    align2: Array  # (3, 3) rotates gravity in camera 2 onto +z
+    rotation: Array  # (3, 3) the predicted R if `predicted`, otherwise meaningless
     predicted: bool
 
 
@@ -79,17 +80,18 @@ class Solver:
     name: str
     sample_size: int  # matches of a minimal sample
     model: Model
-    # Kernel that writes all solutions, the sign of t by the majority of the points; their number.
+    # Kernel that writes all solutions and returns their number. The majority of the points
+    # decides the sign of t.
     solve: Callable[[Sample, Knowledge, Solutions], int]
     most_solutions: int
-    summary: str  # first line of its documentation; the rest is that of `solve`
+    summary: str  # first line of its documentation, which goes on with the docstring of `solve`
     needs_gravity: bool = False  # both alignments of `Knowledge`
     needs_rotation: bool = False  # the predicted rotation of `Knowledge`
     starts_from_rotation: bool = False  # iterative, with `Knowledge.rotation` as first guess
 
     @property
     def address(self) -> int:
-        """Address of the compiled kernel, for `solve_at`; compiles it on first use."""
+        """Address of the compiled kernel, for `solve_at`; the first use compiles it."""
         return _INTERFACE.address(self.solve)
 
 
@@ -105,13 +107,13 @@ solve_at: Callable[[int, Sample, Knowledge, Solutions], int] = _INTERFACE.call
 
 @kernel
 def run_solver(address: int, sample: Sample, known: Knowledge, out: Solutions) -> int:
-    """Write the solutions of one sample to `out`; their number."""
+    """Write the solutions of one sample to `out`; returns their number."""
     return solve_at(address, sample, known, out)
 
 
 @kernel
 def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
-    """Number of points in front of both cameras for ``x = (t, d_1, d_2)`` (9,), and for ``-x``.
+    """Count the points in front of both cameras for ``x = (t, d_1, d_2)`` (9,), and for ``-x``.
 
     Each point is triangulated from the positions of the cameras at its own rows:
     ``lambda_1 f_1 - lambda_2 R f_2 = b = t - tau_1 d_1 + tau_2 d_2`` in the least-squares sense.
@@ -119,8 +121,10 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
     front = 0
     behind = 0
     for k in range(sample.f1.shape[0]):
-        f1, h = sample.f1[k], rotated(R, sample.f2[k])
-        tau1, tau2 = sample.tau1[k], sample.tau2[k]
+        f1 = sample.f1[k]
+        h = rotated(R, sample.f2[k])
+        tau1 = sample.tau1[k]
+        tau2 = sample.tau2[k]
         b = (
             x[0] + (tau2 * x[6] - tau1 * x[3]),
             x[1] + (tau2 * x[7] - tau1 * x[4]),
@@ -145,27 +149,38 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
 
 @kernel
 def gravity_alignment(gravity: Array) -> Array:
-    """Smallest rotation (3, 3) of `gravity` (3,), of any length, onto +z."""
+    """Smallest rotation (3, 3) that takes `gravity` (3,), of any length, to the direction +z."""
     length = norm(gravity)
-    x, y, z = gravity[0] / length, gravity[1] / length, gravity[2] / length
+    x = gravity[0] / length
+    y = gravity[1] / length
+    z = gravity[2] / length
     horizontal2 = x * x + y * y
     A = np.zeros((3, 3))
     if z < 0.0 and horizontal2 < 1e-30:
         # Opposite to z: every half turn about a horizontal axis is a solution.
-        A[0, 0], A[1, 1], A[2, 2] = 1.0, -1.0, -1.0
+        A[0, 0] = 1.0
+        A[1, 1] = -1.0
+        A[2, 2] = -1.0
         return A
     # 1 / (1 + z), without cancellation near z = -1.
     k = 1.0 / (1.0 + z) if z >= 0.0 else (1.0 - z) / horizontal2
-    A[0, 0], A[0, 1], A[0, 2] = 1.0 - k * x * x, -k * x * y, -x
-    A[1, 0], A[1, 1], A[1, 2] = -k * x * y, 1.0 - k * y * y, -y
-    A[2, 0], A[2, 1], A[2, 2] = x, y, z
+    A[0, 0] = 1.0 - k * x * x
+    A[0, 1] = -k * x * y
+    A[0, 2] = -x
+    A[1, 0] = -k * x * y
+    A[1, 1] = 1.0 - k * y * y
+    A[1, 2] = -y
+    A[2, 0] = x
+    A[2, 1] = y
+    A[2, 2] = z
     return A
 
 
 @kernel
 def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
     """Write ``A_1^T Rz(psi) A_2`` into `R` (3, 3)."""
-    c, s = math.cos(psi), math.sin(psi)
+    c = math.cos(psi)
+    s = math.sin(psi)
     A2 = known.align2
     for j in range(3):
         aligned = (c * A2[0, j] - s * A2[1, j], s * A2[0, j] + c * A2[1, j], A2[2, j])
@@ -178,32 +193,38 @@ def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
 def yaw_cluster(sample: Sample, known: Knowledge) -> tuple[float, float]:
     """Centre and width [rad] of the cluster of solutions in psi.
 
-    The normals of distant points all nearly vanish at the true yaw, so that the zeros of their
+    The normals of distant points all nearly vanish at the true yaw, so the zeros of their
     determinants cluster there, within about the parallax. With the aligned rays a and b, the
-    centre is about ``argmax sum a . Rz(psi) b``, the width their rms distance, in [1e-3, 1].
+    centre is about ``argmax sum a . Rz(psi) b``, and the width is the rms distance of a and
+    Rz(psi) b, limited to [1e-3, 1].
     """
     count = sample.f1.shape[0]
-    along, across, total = 0.0, 0.0, 0.0
+    along = 0.0
+    across = 0.0
+    total = 0.0
     for k in range(count):
-        a, b = rotated(known.align1, sample.f1[k]), rotated(known.align2, sample.f2[k])
+        a = rotated(known.align1, sample.f1[k])
+        b = rotated(known.align2, sample.f2[k])
         along += a[0] * b[0] + a[1] * b[1]
         across += a[1] * b[0] - a[0] * b[1]
         total += dot(a, a) + dot(b, b) - 2.0 * a[2] * b[2]
-    # Less the largest sum of the horizontal parts.
+    # The largest sum of the products of the horizontal parts is at the centre.
     total -= 2.0 * math.sqrt(along * along + across * across)
-    return math.atan2(across, along), min(max(math.sqrt(max(total, 0.0) / count), 1e-3), 1.0)
+    width = math.sqrt(max(total, 0.0) / count)
+    return math.atan2(across, along), min(max(width, 1e-3), 1.0)
 
 
-# The nine columns of the uniform and linear models, well conditioned. A row of the paper's
-# ``A x = 0`` is ``[n, -tau_1 n, tau_2 n]`` with ``n = f_1 x R f_2`` and ``x = (t, d_1, d_2)``
-# (docs/conventions.md, equation 4). Matched points are in similar rows, and row times are 1e-2 s:
-# these three blocks are nearly parallel and badly scaled. The kernels therefore use
+# The nine columns of the uniform and linear models are made well conditioned here. A row of the
+# paper's ``A x = 0`` is ``[n, -tau_1 n, tau_2 n]`` with ``n = f_1 x R f_2`` and
+# ``x = (t, d_1, d_2)`` (docs/conventions.md, equation 4). Matched points lie in similar rows, and
+# row times are 1e-2 s, so these three blocks are nearly parallel and badly scaled. The kernels
+# therefore use
 #
 #     t - tau_1 d_1 + tau_2 d_2 = y_1 + p y_2 + q y_3
 #     p = (tau_1 - m) / s_p,    q = (tau_2 - tau_1) / s_q
 #
-# with the mean row time m and p, q of size 1; the two sets of columns span the same space for any
-# rotation: determinants differ by a constant factor, solutions by a linear map
+# with the mean row time m, and p, q of size 1. Both sets of columns span the same space for any
+# rotation: their determinants differ by a constant factor, their solutions by a linear map
 # (`write_solution`).
 
 
@@ -220,20 +241,23 @@ class RowTimeFactors(NamedTuple):
 
 @kernel
 def row_time_factors(sample: Sample) -> RowTimeFactors:
-    """Factors of a sample; p and q are not scaled if velocities are not observable."""
-    tau1, tau2 = sample.tau1, sample.tau2
+    """Scale the row times of a sample; p and q stay in [s] if velocities are not observable."""
+    tau1 = sample.tau1
+    tau2 = sample.tau2
     n = tau1.shape[0]
     m = 0.0
     for k in range(n):
         m += tau1[k] / n
-    p, q = np.empty(n), np.empty(n)
-    s_p, s_q = 0.0, 0.0
+    p = np.empty(n)
+    q = np.empty(n)
+    s_p = 0.0
+    s_q = 0.0
     for k in range(n):
         p[k] = tau1[k] - m
         q[k] = tau2[k] - tau1[k]
         s_p = max(s_p, abs(p[k]))
         s_q = max(s_q, abs(q[k]))
-    # Velocity and translation are not distinguishable for closer row times [s].
+    # Velocity and translation cannot be distinguished if row times are closer than this [s].
     least = 1e-12
     observable = least < s_p < math.inf and least < s_q < math.inf
     if observable:
@@ -244,7 +268,7 @@ def row_time_factors(sample: Sample) -> RowTimeFactors:
 
 
 # All solvers end with Newton's method on ``A(R) y = 0``, which removes the rounding of polynomials
-# and eliminations: y is t, or (y_1, y_2, y_3), of length 1.
+# and eliminations. The unit vector y is t, or (y_1, y_2, y_3).
 
 
 @kernel
@@ -263,7 +287,8 @@ def write_rows(sample: Sample, factors: RowTimeFactors, R: Array, A: Array, firs
 def write_nearest_vector(sample: Sample, factors: RowTimeFactors, R: Array, y: Array) -> None:
     """Write the vector of the smallest singular value of A(R) into `y`, by inverse iteration."""
     m = y.shape[0]
-    A, factor = np.empty((sample.f1.shape[0], m)), np.zeros((m, m))
+    A = np.empty((sample.f1.shape[0], m))
+    factor = np.zeros((m, m))
     write_rows(sample, factors, R, A, 0)
     gram = A.T @ A
     for i in range(m):
@@ -285,15 +310,22 @@ def linearise(
     system: Array,
     right: Array,
 ) -> tuple[float, float]:
-    """Write the n + 1 equations of a Newton step (`polish`); ``|A(R) y|^2`` and ``|A(R)|^2``."""
-    n, k, m = sample.f1.shape[0], axes.shape[0], y.shape[0]
+    """Write the n + 1 equations of a Newton step of `polish` into `system` and `right`.
+
+    Returns ``|A(R) y|^2`` and ``|A(R)|^2``.
+    """
+    n = sample.f1.shape[0]
+    k = axes.shape[0]
+    m = y.shape[0]
     write_rows(sample, factors, R, system, k)
-    squares, size2 = 0.0, 0.0
+    squares = 0.0
+    size2 = 0.0
     for i in range(n):
-        # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) = theta . (h x (b x f_1)), h = R f_2
+        # With b = y_1 + p y_2 + q y_3 and h = R f_2, d((f_1 x h) . b) = theta . (h x (b x f_1)).
         b = (y[0], y[1], y[2])
         if m > 3:
-            p, q = factors.p[i], factors.q[i]
+            p = factors.p[i]
+            q = factors.q[i]
             b = (
                 b[0] + p * y[3] + q * y[6],
                 b[1] + p * y[4] + q * y[7],
@@ -317,15 +349,22 @@ def linearise(
 def polish(
     sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array, steps: int
 ) -> bool:
-    """Newton's method from `R` (3, 3) and `y` (m,), in place; whether it has converged.
+    """Improve `R` (3, 3) and `y` (m,) in place by Newton's method; returns whether it converged.
 
-    R moves about the `axes` (k, 3), n equations having n + 1 = m + k unknowns with ``|y| = 1``. A
-    step that does not reduce the error is shortened.
+    R moves about the `axes` (k, 3). The n equations have m + k = n + 1 unknowns, and ``|y| = 1``
+    is the last equation. A step that does not reduce the error is shortened.
     """
-    n, k = sample.f1.shape[0], axes.shape[0]
-    system, right, pivots = np.zeros((n + 1, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int64)
-    step, turn, error, size2 = np.zeros(n + 1), np.empty(3), math.inf, 0.0
-    R_new, y_new = R.copy(), y.copy()
+    n = sample.f1.shape[0]
+    k = axes.shape[0]
+    system = np.zeros((n + 1, n + 1))
+    right = np.empty(n + 1)
+    pivots = np.empty(n + 1, np.int64)
+    step = np.zeros(n + 1)
+    turn = np.empty(3)
+    error = math.inf
+    size2 = 0.0
+    R_new = R.copy()
+    y_new = y.copy()
     for _ in range(steps):
         squares, size2 = linearise(sample, factors, axes, R_new, y_new, system, right)
         if squares < error:
@@ -372,16 +411,17 @@ def is_known(R: Array, rotations: Array) -> bool:
 def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, x: Array) -> bool:
     """Write ``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y`; False if there is no translation.
 
-    With the sign that has more points in front of both cameras.
+    Of x and -x, the one with more points in front of both cameras is written.
     """
     for i in range(3):
-        difference = 0.0  # d_2 - d_1
+        difference = 0.0  # ``d_2 - d_1``
         if len(y) > 3:
-            difference, x[6 + i] = y[3 + i] / factors.s_p, y[6 + i] / factors.s_q
+            difference = y[3 + i] / factors.s_p
+            x[6 + i] = y[6 + i] / factors.s_q
             x[3 + i] = x[6 + i] - difference
         x[i] = y[i] - factors.m * difference
     length2 = dot(x, x)
-    # |y| = 1: a translation of this size is rounding.
+    # As |y| = 1, a translation of this size is rounding.
     if not 1e-20 < length2 < math.inf:
         return False
     x *= 1.0 / math.sqrt(length2)
@@ -394,7 +434,7 @@ def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, 
 
 @kernel
 def solve_gyro_2pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
-    """Rotation known: t is perpendicular to the normals ``n = f_1 x R f_2`` of both matches."""
+    """With R known, t is perpendicular to the normals ``n = f_1 x R f_2`` of both matches."""
     R = known.rotation
     n1 = cross(sample.f1[0], rotated(R, sample.f2[0]))
     n2 = cross(sample.f1[1], rotated(R, sample.f2[1]))
