@@ -14,8 +14,7 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
     from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-    from rs_relpose_ros.estimator.estimate import estimate_relative_pose
-    from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+    from rs_relpose_ros.estimator.arguments import estimate_relative_pose, IntermediateFrame
     from rs_relpose_ros.estimator.result import RelativePose, Status
     from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
     from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
@@ -59,7 +58,7 @@ _HOMES = {
     'ImuSample': 'imu.buffer',
     'InertialMotion': 'geometry.motion',
     'InputError': 'errors',
-    'IntermediateFrame': 'estimator.frames_between',
+    'IntermediateFrame': 'estimator.arguments',
     'Intrinsics': 'geometry.camera',
     'MissingInputError': 'errors',
     'PairSynchronizer': 'messages.published_pair',
@@ -70,7 +69,7 @@ _HOMES = {
     'RsRelposeError': 'errors',
     'RowTrajectory': 'odometry.rows',
     'Status': 'estimator.result',
-    'estimate_relative_pose': 'estimator.estimate',
+    'estimate_relative_pose': 'estimator.arguments',
     'estimate_wide_pair': 'pipeline.chosen_pairs',
     'view_frame': 'pipeline.chosen_pairs',
     'warm_up': 'pipeline.warm_up',

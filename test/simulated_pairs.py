@@ -12,11 +12,11 @@ from rs_relpose_lab.experiments import problems
 from rs_relpose_lab.experiments.problems import VIEW
 from rs_relpose_lab.simulation.rows import observe, uniform_motion
 from rs_relpose_ros import estimate_relative_pose, FrameMotion, RollingShutterCamera
-from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
+from rs_relpose_ros.estimator.result import Diagnostics, Landmarks, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.tracking.features import Matches
 
 SCENE_CAMERA = {
     'width': VIEW.width,
@@ -115,7 +115,7 @@ def simulated_flight(
             inliers=np.ones(len(use), dtype=bool),
             covariance=1e-6 * np.eye(6),
             velocity_covariance=1e-4 * np.eye(6),
-            model='uniform',
+            diagnostics=Diagnostics(model='uniform'),
         )
         if length > 0.0:
             pose = replace(
@@ -127,13 +127,16 @@ def simulated_flight(
         else:
             pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
         matches = Matches(
-            use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use], np.ones(len(use))
+            use.astype(np.uint32) + 7,
+            np.stack([a.pixels[use], b.pixels[use]]),
+            np.ones(len(use)),
+            np.stack([a.rays[use], b.rays[use]]),
+            np.stack([a.tau[use], b.tau[use]]),
         )
         true_landmarks.append(
             Landmarks(VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use])
         )
-        rows = a.rays[use], b.rays[use], a.tau[use], b.tau[use]
-        points = cache(partial(landmarks, pose, *rows, SENSOR.camera))
+        points = cache(partial(landmarks, pose, matches.rays, matches.row_times, SENSOR.camera))
         stamps = [START_NS + round(1e9 * time) for time in TIMES[k : k + 2]]
         pairs.append(
             PairResult(
@@ -143,8 +146,6 @@ def simulated_flight(
                 TIMES[k + 1] - TIMES[k],
                 pose,
                 matches,
-                *rows[2:],
-                *rows[:2],
                 10.0,
                 points if pose else None,
             )

@@ -582,17 +582,19 @@ def test_exact_matches_give_the_truth(seed):
 def test_parallel_rays_have_no_point_and_outliers_have_nothing():
     pair = simulated_flight(1).pairs[0]
 
-    def found(pose, rays2):
-        return landmarks(pose, pair.rays1, rays2, pair.row_times1, pair.row_times2, SENSOR.camera)
+    rays1, rays2 = pair.matches.rays
 
-    parallel = pair.rays1 @ pair.pose.R
+    def found(pose, second):
+        return landmarks(pose, np.stack([rays1, second]), pair.matches.row_times, SENSOR.camera)
+
+    parallel = rays1 @ pair.pose.R
     of_parallel = found(pair.pose, parallel)
     assert np.isnan(of_parallel.points).all()
     # Derotated to the stamped row, as of a camera that only rotates.
-    np.testing.assert_allclose(of_parallel.pixels1, SENSOR.camera.project(pair.rays1), atol=1e-9)
+    np.testing.assert_allclose(of_parallel.pixels1, SENSOR.camera.project(rays1), atol=1e-9)
     np.testing.assert_allclose(of_parallel.pixels2, SENSOR.camera.project(parallel), atol=1e-9)
     inliers = np.arange(len(pair.matches)) % 3 > 0
-    for values in found(replace(pair.pose, inliers=inliers), pair.rays2):
+    for values in found(replace(pair.pose, inliers=inliers), rays2):
         np.testing.assert_array_equal(np.isfinite(values).all(axis=1), inliers)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros import estimate_relative_pose, EstimatorConfig, InputError, Status
 from rs_relpose_ros.estimator import adjustment, frames_between
-from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.estimator.arguments import IntermediateFrame
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 

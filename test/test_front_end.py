@@ -23,6 +23,7 @@ from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.imu.buffer import ImuSample
@@ -33,7 +34,7 @@ from rs_relpose_ros.nodes.relpose_node import PairPublishers, RelposeNode
 from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.pipeline import pair as pairs
 from rs_relpose_ros.pipeline import sequencer
-from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, median_parallax, PairResult
+from rs_relpose_ros.pipeline.pair import derotated, Frame, median_parallax, PairResult, positions
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd, Outcome
 from rs_relpose_ros.pipeline.sequencer import MAILBOX_FRAMES, QueuedFrame, Refusal
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage
@@ -461,28 +462,38 @@ LENS = Sensor(LENS_CAMERA, LENS_INTRINSICS, ImageClock(LENS_CAMERA))
 MOTION = FrameMotion([0.4, -0.8, 0.3])
 
 
-def rays_of(ids):
+def matches_of(ids):
     """Of a set of points that depend on their ids alone."""
     ids = np.asarray(ids, dtype=np.uint32)
     points = np.random.default_rng(0).uniform([20.0, 20.0], [620.0, 460.0], (5000, 2))[ids % 5000]
-    return DerotatedRays.from_points(ids, points, LENS, MOTION)
+    return Matches(ids, np.stack([points, points + 3.0]), np.ones(len(ids)))
 
 
 # Ids wrap around: what is newer may be smaller.
 @pytest.mark.parametrize('ids', [range(40), [2**32 - 2, 2**32 - 1, 0, 1, 2, 3, 700, 30]])
 def test_rays_that_are_kept_are_the_same_as_recomputed(ids):
-    every = rays_of(list(ids))
-    some = every.track_ids[[0, 2, 3, 6]]
-    kept, recomputed = every.of(some), rays_of(some)
-    assert every.of(every.track_ids) is every
-    assert len(every.of(every.track_ids[:0]).rays) == 0
-    for name in ('track_ids', 'points', 'rays', 'row_times'):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(recomputed, name))
+    every = derotated(matches_of(list(ids)), MOTION, MOTION, LENS)
+    # The rays of the reference are taken from those that are known.
+    marked = replace(every, rays=every.rays + 1.0)
+    for wanted in (every.track_ids[[0, 2, 3, 6]], every.track_ids, every.track_ids[:0]):
+        some = matches_of(wanted)
+        kept = derotated(some, MOTION, MOTION, LENS, every)
+        recomputed = derotated(some, MOTION, MOTION, LENS)
+        for name in ('track_ids', 'points', 'rays', 'row_times'):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(recomputed, name))
+        of_marked = derotated(some, MOTION, MOTION, LENS, marked)
+        np.testing.assert_array_equal(of_marked.rays[0], recomputed.rays[0] + 1.0)
+        np.testing.assert_array_equal(of_marked.rays[1], recomputed.rays[1])
 
 
 def test_a_track_that_is_missing_or_out_of_order_is_no_subset():
+    known = derotated(matches_of(range(9)), MOTION, MOTION, LENS)
     for wanted in ([3, 99], [99], [5, 3]):
-        assert rays_of(range(9)).of(np.array(wanted, dtype=np.uint32)) is None
+        some = matches_of(wanted)
+        assert len(positions(known.track_ids, some.track_ids)) < len(wanted)
+        kept = derotated(some, MOTION, MOTION, LENS, known)
+        recomputed = derotated(some, MOTION, MOTION, LENS)
+        np.testing.assert_array_equal(kept.rays, recomputed.rays)
 
 
 def test_a_derotated_ray_is_projected_to_its_pixel():

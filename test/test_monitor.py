@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.arguments import estimate_relative_pose
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
@@ -1069,10 +1069,9 @@ def agreeing_pairs(scatter, count=60, seed=0, frames=5, gyro_square=0.0):
             Status.OK,
             R=np.eye(3),
             t=np.array([0.0, 0.0, 1.0]),
-            frames=frames,
             linear_velocity1=ends[0],
             linear_velocity2=ends[1],
-            gyro_square=gyro_square,
+            diagnostics=Diagnostics(frames=frames, gyro_square=gyro_square),
             linear_velocity1_covariance=spread if frames > 2 else np.full((3, 3), np.nan),
             covariance=np.diag([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]),
             velocity_covariance=np.diag([*np.diag(spread), 1.0, 1.0, 1.0]),
@@ -1130,7 +1129,7 @@ def test_only_consecutive_pairs_with_frames_between_are_compared():
 
 def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
     poses = list(agreeing_pairs(0.5))
-    poses[10] = replace(poses[10], gyro_square=31.0)
+    poses[10] = poses[10].diagnosed(gyro_square=31.0)
     assert list(np.flatnonzero(factors(poses) != 1.0)) == [10]
     assert factors(poses)[10] == pytest.approx(8.0)
 

@@ -19,7 +19,8 @@ from rclpy.parameter import Parameter
 from rclpy.task import Task
 
 from rs_relpose_ros.config.settings import Declared, Parameters
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Silence, Statistics, WARN
 from rs_relpose_ros.nodes.inputs import KeptWaitSet
@@ -28,7 +29,6 @@ from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
-from rs_relpose_ros.tracking.features import Matches
 
 SECOND = 10**9
 
@@ -212,7 +212,6 @@ def test_other_changes_of_stamps_are_no_jitter(change):
 def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
     count = 20
     inliers = np.arange(count) < 15
-    zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
     return PairResult(
         reference_stamp_ns=0,
         stamp_ns=1,
@@ -220,12 +219,19 @@ def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
         reference_ns2=1,
         frame_id='',
         interval=0.1,
-        pose=RelativePose(status=status, reason=reason, inliers=inliers, model='uniform'),
-        matches=Matches(np.arange(count, dtype=np.uint32), zeros2, zeros2, np.ones(count)),
-        row_times1=np.zeros(count),
-        row_times2=np.zeros(count),
-        rays1=zeros3,
-        rays2=zeros3,
+        pose=RelativePose(
+            status=status,
+            reason=reason,
+            inliers=inliers,
+            diagnostics=Diagnostics(model='uniform'),
+        ),
+        matches=Matches(
+            np.arange(count, dtype=np.uint32),
+            np.zeros((2, count, 2)),
+            np.ones(count),
+            np.zeros((2, count, 3)),
+            np.zeros((2, count)),
+        ),
         parallax=3.25,
     )
 

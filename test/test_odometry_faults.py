@@ -48,6 +48,7 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Landmarks, RelativePose, Status
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
@@ -60,7 +61,6 @@ from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.tracking.features import Matches
 
 # The node may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -131,11 +131,7 @@ def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
         pair.frame_id,
         0.15,
         pose,
-        Matches.none(),
-        none[:, 0],
-        none[:, 0],
-        none,
-        none,
+        replace(Matches.none(), rays=np.zeros((2, 0, 3)), row_times=np.zeros((2, 0))),
         10.0,
         lambda: Landmarks(none[:, :2], none[:, :2], none),
         gyro_bias=pair.gyro_bias,

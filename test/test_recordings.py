@@ -20,7 +20,7 @@ import yaml
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, sensor_model, TrackingConfig
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.arguments import estimate_relative_pose
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample
 from rs_relpose_ros.offline.replay import Replay
@@ -402,13 +402,13 @@ def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, c
         points = pair.matches.points1, pair.matches.points2
         use = np.maximum(points[0], points[1])[:, 1] < LAST_ROW.get(name, np.inf)
         measured = [camera.unproject(intrinsics.to_sensor(p[use])) for p in points]
-        derotated = [rays[use] for rays in (pair.rays1, pair.rays2)]
+        derotated = [rays[use] for rays in pair.matches.rays]
         # As far to the other side of the measured ray.
         wrong = [
             2.0 * (f * g).sum(axis=1, keepdims=True) * f - g
             for f, g in zip(measured, derotated, strict=True)
         ]
-        times = [times[use] for times in (pair.row_times1, pair.row_times2)]
+        times = [times[use] for times in pair.matches.row_times]
         costs.append(
             [
                 *(robust_cost(*rays, camera.fx) for rays in (measured, derotated, wrong)),

@@ -18,7 +18,7 @@ import numpy as np
 from rs_relpose_lab.experiments import problems
 from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
 from rs_relpose_ros.config.settings import EstimatorConfig
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.arguments import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera

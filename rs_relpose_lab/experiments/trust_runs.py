@@ -4,7 +4,7 @@ Recordings are simulated, with rendered images or with tracks alone, or real.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import heapq
 import math
 from pathlib import Path
@@ -26,13 +26,14 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
-from rs_relpose_ros.tracking.features import keep_apart, Matches, TrackIds
+from rs_relpose_ros.tracking.features import keep_apart, TrackIds
 from rs_relpose_ros.tracking.images import Image, RawImage
 
 Gray = NDArray[np.uint8]
@@ -224,7 +225,7 @@ class SimulatedTracker:
             # Then `KltTracker` searches at the previous positions.
             reached |= np.linalg.norm(points - self._matches.points2, axis=1) < _REACH
         good = (known.ids[frame][rows] == self._corners) & self._inside(points) & reached
-        self._matches = replace(self._matches, points2=points).kept(good)
+        self._matches = self._matches.followed(points).kept(good)
         self._corners, self._offsets = self._corners[good], self._offsets[good]
         self._places = places[good]
         return self._matches
@@ -249,8 +250,7 @@ class SimulatedTracker:
         points = self._published(self._places)
         self._matches = Matches(
             np.concatenate([self._matches.track_ids[kept], self._ids.take(len(new))]),
-            points,
-            points,
+            np.stack([points, points]),
             np.ones(len(points)),
         )
         self._started, self._reference = len(points), self._frame

@@ -77,7 +77,7 @@ _COMMON_SIGMA = 0.06
 _GAUSSIAN = 1.109
 
 
-class Tracks(NamedTuple):
+class TrackBlocks(NamedTuple):
     """Observations of N tracks in V frames, in blocks; those not used are zero."""
 
     observations: Array  # (V, blocks, VALUES, BLOCK)
@@ -89,7 +89,7 @@ class Tracks(NamedTuple):
 
 @kernel
 def fill_view(
-    tracks: Tracks,
+    tracks: TrackBlocks,
     v: int,
     used: Flags,
     rays: Array,
@@ -166,7 +166,7 @@ class PathState(NamedTuple):
 
 
 @kernel
-def start_of_tracks(tracks: Tracks, R: Array, t: Array) -> Array:
+def start_of_tracks(tracks: TrackBlocks, R: Array, t: Array) -> Array:
     """Tracks of a state (blocks, TRACK_VALUES, BLOCK) by their first and last rays.
 
     Columns across a ray: Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 6, 2017).
@@ -254,8 +254,9 @@ def _observe(
 ) -> None:
     """Derivatives (_ROWS, 2, BLOCK) of a block's observations, times the roots of their weights.
 
-    `o`, `track`: blocks of `Tracks` and of `PathState`; R of the frame; `motion` (5, 3): t, bias
-    and accelerations; `variance`: of the noise; `moves`: 0 for the first frame, whose phi is zero.
+    `o`, `track`: blocks of `TrackBlocks` and of `PathState`; R of the frame; `motion` (5, 3): t,
+    bias and accelerations; `variance`: of the noise; `moves`: 0 for the first frame, whose phi is
+    zero.
     """
     for i in range(BLOCK):
         s, rho = o[TIME, i], track[INVERSE_DISTANCE, i]
@@ -410,7 +411,7 @@ def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: 
 
 
 @kernel
-def linearised(tracks: Tracks, priors: PathPriors, state: PathState, sigma: float) -> Normal:
+def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma: float) -> Normal:
     """Normal equations about a state, with the noise `sigma` [px]."""
     V, blocks, _ = tracks.used.shape
     path = ACCELERATION + 3 * len(state.accelerations)
@@ -465,7 +466,7 @@ def linearised(tracks: Tracks, priors: PathPriors, state: PathState, sigma: floa
 
 
 @kernel
-def _cost(normal: Normal, tracks: Tracks, sigma: float) -> tuple[float, float]:
+def _cost(normal: Normal, tracks: TrackBlocks, sigma: float) -> tuple[float, float]:
     """Cost with the noise `sigma` [px], and the noise by these residuals, once iterated."""
     cost, weighted, count = normal.of_priors, 0.0, 0
     used, squares = tracks.used.ravel(), normal.squares.ravel()
@@ -529,7 +530,7 @@ def _step(normal: Normal, damping: float) -> Array:
 
 @kernel
 def adjust(
-    tracks: Tracks, priors: PathPriors, start: PathState, expected: float, weight: float
+    tracks: TrackBlocks, priors: PathPriors, start: PathState, expected: float, weight: float
 ) -> Adjusted:
     """Levenberg-Marquardt over path and tracks, the noise estimated again after each step.
 

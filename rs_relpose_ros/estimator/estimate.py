@@ -1,12 +1,10 @@
 """One frame pair, end to end: derotate, sample, optimise, refine, covariance."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 import math
 import time
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.core.losses import Flags, noise_mixture
@@ -20,73 +18,15 @@ from rs_relpose_ros.estimator import (
     sampson,
     velocity,
 )
-from rs_relpose_ros.estimator.frames_between import checked_rotation, IntermediateFrame
+from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
-from rs_relpose_ros.estimator.problem import build_problem, to_reference_row, TwoViewProblem
-from rs_relpose_ros.estimator.result import landmarks, RelativePose, Status
+from rs_relpose_ros.estimator.problem import to_reference_row, TwoViewProblem
+from rs_relpose_ros.estimator.result import Diagnostics, landmarks, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import SolverMode
 from rs_relpose_ros.estimator.sampson import RayMatches
 from rs_relpose_ros.estimator.velocity import Refined
-from rs_relpose_ros.geometry import Array, so3, validate
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.solvers.common import Solutions
-
-# -- Arguments of `estimate_relative_pose`: each error names the argument -------------------------
-
-
-def _checked_matches(
-    points1: ArrayLike,
-    points2: ArrayLike,
-    quality: ArrayLike | None,
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Pixels (N, 2) of both frames, and the sampling order of the matches."""
-    count: int | str = 'N'
-    checked = []
-    for name, value in (('points1', points1), ('points2', points2)):
-        empty = value.size == 0 if isinstance(value, np.ndarray) else value in ([], ())
-        checked.append(
-            validate.array(
-                name,
-                np.empty((0, 2)) if empty else value,
-                (count, 2),
-                largest=frames_between.LARGEST_PIXEL,
-                unit='px',
-            )
-        )
-        count = len(checked[0])
-    if quality is None:
-        return checked[0], checked[1], np.arange(count)
-    order = np.argsort(-validate.array('quality', quality, (count,)), kind='stable')
-    return checked[0], checked[1], order
-
-
-def _checked_interval(interval: float | None, inertial: InertialMotion | None) -> float | None:
-    """Seconds between the frames: `interval` or the duration of `inertial`; None without both."""
-    if interval is not None:
-        interval = validate.number('interval', interval, 1e-6, 1e6, 's')
-    if inertial is None:
-        return interval
-    if interval is not None and not math.isclose(interval, inertial.duration, abs_tol=1e-6):
-        raise InputError(
-            'interval must equal the duration of inertial, '
-            f'got {interval:.9g} and {inertial.duration:.9g} s'
-        )
-    return inertial.duration
-
-
-def _checked_mode(
-    config: EstimatorConfig, motion1: FrameMotion, motion2: FrameMotion
-) -> sampling.SolverMode:
-    """Mode of the solver; it may need gravity."""
-    mode = sampling.MODES[config.solver]
-    if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
-        raise InputError(
-            f'solver {config.solver!r} requires gravity in both frames; without it, '
-            'use auto, uniform_11pt or angular_5pt'
-        )
-    return mode
-
 
 # Prior sigma of the velocities while hypotheses are compared [baselines per second].
 SAMPLING_VELOCITY_SIGMA = 3.0
@@ -113,104 +53,44 @@ CONTRADICTION = 65.0
 DEGENERATE_THRESHOLDS = 2.0
 
 
-def estimate_relative_pose(
-    points1: ArrayLike,
-    points2: ArrayLike,
-    camera: RollingShutterCamera,
-    motion1: FrameMotion,
-    motion2: FrameMotion,
-    relative_rotation: ArrayLike | None = None,
-    relative_rotation_covariance: ArrayLike | None = None,
-    interval: float | None = None,
-    config: EstimatorConfig | None = None,
-    rng: int | np.random.Generator = 0,
-    *,
-    quality: ArrayLike | None = None,
-    inertial: InertialMotion | None = None,
-    between: Sequence[IntermediateFrame] = (),
-    global_shutter_pixels: bool = False,
-) -> RelativePose:
-    """Relative pose of two rolling-shutter frames from matches, gyro and gravity.
+def estimate(problem: PairProblem) -> RelativePose:
+    """The pose of a pair, from two views and then from all frames.
 
-    Parameters
-    ----------
-    points1, points2 : (N, 2) array_like
-        Matches in raw (distorted) pixels.
-    camera : RollingShutterCamera
-        The pose relates its reference rows.
-    motion1, motion2 : FrameMotion
-        Angular velocity and gravity of each frame at its reference row; gravity may be None.
-    relative_rotation, relative_rotation_covariance : (3, 3) array_like, optional
-        ``R_1^T R_2`` between the reference rows as predicted from the gyro, and the covariance of
-        its error in camera 1 [rad^2]: ``R_true = Exp(dtheta) relative_rotation``.
-    interval : float, optional
-        Seconds between the two reference rows, for velocities of `EstimatorConfig.motion`.
-    rng : int or numpy.random.Generator
-        Equal input and state give an equal result, bit by bit.
-    quality : (N,) array_like, optional
-        Higher is better: the sampling order of the matches.
-    inertial : InertialMotion, optional
-        Preintegrated acceleration between the two reference rows: determines velocities and
-        baseline in metres. `interval` must be its duration, or None.
-    between : sequence of IntermediateFrame
-        Frames between the two, in the order of time; requires `interval` or `inertial`.
-    global_shutter_pixels : bool
-        Whether the result has `pixels1_gs` and `pixels2_gs`.
-
-    Returns
-    -------
-    RelativePose
-        Falsy, with `status` and `reason`, if the data determine no pose.
-
-    Raises
-    ------
-    InputError
-        (a ValueError) An argument of the wrong shape, not finite, or contradictory.
+    Raises InputError for a solver that needs gravity, without it.
     """
-    started, config = time.perf_counter(), config or EstimatorConfig()
-    points1, points2, order = _checked_matches(points1, points2, quality)
-    rotation, spread = checked_rotation(relative_rotation, relative_rotation_covariance)
-    interval = frames_between.check(between, points1, _checked_interval(interval, inertial))
-    mode = _checked_mode(config, motion1, motion2)
-    problem = build_problem(
-        points1, points2, camera, motion1, motion2, rotation, spread, mode.model.derotated
-    )
-    seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    pose = Estimation(problem, mode, config, order, seed, interval, inertial).run(bool(between))
-    pose = _certain(
-        frames_between.refined(
-            pose,
-            points1,
-            motion1,
-            (points2, motion2, interval, rotation, spread, inertial),
-            between,
-            camera,
-            config,
-        ),
-        config,
-    )
-    if global_shutter_pixels and pose:
-        pose = _with_global_shutter_pixels(pose, points1, points2, camera, motion1, motion2)
-    return replace(pose, duration=time.perf_counter() - started)
+    started = time.perf_counter()
+    pose = frames_between.refined(Estimation(problem).run(), problem)
+    pose = _certain(pose, problem.config)
+    if problem.no_inertial:
+        pose = pose.without_baseline(f'baseline not known: {problem.no_inertial}')
+    return pose.diagnosed(duration=time.perf_counter() - started)
 
 
-def _with_global_shutter_pixels(
-    pose: RelativePose,
-    points1: Array,
-    points2: Array,
-    camera: RollingShutterCamera,
-    motion1: FrameMotion,
-    motion2: FrameMotion,
-) -> RelativePose:
-    times1, times2 = camera.row_times(points1[:, 1]), camera.row_times(points2[:, 1])
-    found = landmarks(
-        pose,
-        motion1.derotate(camera.unproject(points1), times1),
-        motion2.derotate(camera.unproject(points2), times2),
-        times1,
-        times2,
-        camera,
-    )
+def evidence_for_inertial(
+    pose: RelativePose, problem: PairProblem
+) -> velocity.InertialEvidence | None:
+    """Consistency of a pose's images with an acceleration that it was not estimated with."""
+    interval = problem.interval
+    if pose.images is None or interval is None:
+        return None
+    motion = problem.config.motion
+    views = problem.without_matches().two_views()
+    expected, _ = velocity.expected_velocities(views, motion, interval, problem.inertial[-1])
+    return velocity.inertial_evidence(views, pose.images, motion, interval, expected)
+
+
+def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> RelativePose:
+    """The pose with the global-shutter pixels of its inliers."""
+    camera, matches = problem.camera, problem.matches
+    rays = []
+    times = []
+    for points, motion in (
+        (matches.points1, problem.motions[0]),
+        (matches.points2, problem.motions[-1]),
+    ):
+        times.append(camera.row_times(points[:, 1]))
+        rays.append(motion.derotate(camera.unproject(points), times[-1]))
+    found = landmarks(pose, np.stack(rays), np.stack(times), camera)
     return replace(pose, pixels1_gs=found.pixels1, pixels2_gs=found.pixels2)
 
 
@@ -218,7 +98,8 @@ def _certain(pose: RelativePose, config: EstimatorConfig) -> RelativePose:
     """The pose, or its rotation alone if the direction of t is too uncertain."""
     limit = config.max_translation_sigma
     # Of both degrees of freedom of a direction, together.
-    sigma = np.degrees(np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0)))
+    variance = max(np.trace(pose.covariance[:3, :3]), 0.0)
+    sigma = np.degrees(np.sqrt(variance))
     if not pose or sigma <= limit:
         return pose
     return pose.without_translation(
@@ -236,48 +117,46 @@ class Estimation:
     fit with the scale of the velocities chosen by its evidence (with `inertial`: the baseline),
     sandwich covariance over image regions.
 
-    `order` (N,): sampling order of the matches. `seed` (1,): state of the random number generator.
-    `interval`: seconds between the frames.
     """
 
-    def __init__(
-        self,
-        problem: TwoViewProblem,
-        mode: SolverMode,
-        config: EstimatorConfig,
-        order: NDArray[np.int64],
-        seed: NDArray[np.uint64],
-        interval: float | None,
-        inertial: InertialMotion | None = None,
-    ) -> None:
-        self.problem, self.mode, self.config = problem, mode, config
+    def __init__(self, pair: PairProblem) -> None:
+        self.config = config = pair.config
+        self.mode = _mode(pair)
+        self.problem = problem = pair.two_views(self.mode.model.derotated)
+        # Usable matches, the best ones first: the sampling order.
+        order = np.argsort(-pair.matches.quality, kind='stable')
         self.order = order[problem.valid[order]]
-        self.seed = seed
+        self.seed = np.array([pair.seed], dtype=np.uint64)
         self.matches = RayMatches(
             problem.observations, problem.valid, config.pixel_sigma / problem.focal
         )
-        self.priors = _priors(problem, mode, config, interval)
-        self.interval, self.inertial = interval, inertial
+        self.interval = pair.interval
+        self.inertial = pair.inertial[-1]
+        self.has_frames_between = len(pair.motions) > 2
+        self.priors = _priors(problem, self.mode, config, self.interval)
         # Prior of the velocities by the measured acceleration, and the chi-square (6 degrees of
         # freedom) of that acceleration against zero.
         self.measured: VelocityPrior | None = None
         self.inertial_chi2 = 0.0
         self.iterations = 0
-        self.deadline = (
-            time.perf_counter() + config.time_limit if config.time_limit > 0.0 else math.inf
-        )
+        limit = config.time_limit
+        self.deadline = time.perf_counter() + limit if limit > 0.0 else math.inf
         # Whether solvers were skipped, since one before them had enough inliers.
         self.solvers_skipped = False
 
-    def run(self, warm: bool = False) -> RelativePose:
-        """The pose, or the reason why there is none; `warm`: samples only if `_by_gyro` fails."""
-        if len(self.order) < self.config.min_inliers:
+    def run(self) -> RelativePose:
+        """The pose of two views, or the reason why there is none.
+
+        With frames between, samples are drawn only if the gyro's rotation fails: all frames will
+        refine the pose.
+        """
+        usable, least = len(self.order), self.config.min_inliers
+        if usable < least:
             return self._failure(
                 Status.TOO_FEW_MATCHES,
-                f'{len(self.order)} usable matches, fewer than min_inliers = '
-                f'{self.config.min_inliers}',
+                f'{usable} usable matches, fewer than min_inliers = {least}',
             )
-        if warm and (state := self._by_gyro()) is not None:
+        if self.has_frames_between and (state := self._by_gyro()) is not None:
             return self._completed(state)
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
         return self.refine(self.sample())
@@ -320,9 +199,7 @@ class Estimation:
         if reason := self._no_consensus(refined.inliers):
             return self._failure(Status.NO_CONSENSUS, reason)
         if reason := self._contradiction(refined.state):
-            return replace(
-                self._failure(Status.NO_CONSENSUS, reason), rejected=self._result(refined)
-            )
+            return self._failure(Status.NO_CONSENSUS, reason, rejected=self._result(refined))
         # 4. Is the translation observable?
         rotation_only = self._rotation_only(refined)
         if rotation_only is not None:
@@ -523,9 +400,11 @@ class Estimation:
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
             velocity_covariance=velocity_covariance,
-            model='angular',
-            iterations=self.iterations,
-            residual_rms=float(np.sqrt(np.mean(left**2))),
+            diagnostics=Diagnostics(
+                model='angular',
+                iterations=self.iterations,
+                residual_rms=float(np.sqrt(np.mean(left**2))),
+            ),
         )
 
     def _rotations_to_reference_row(self, state: TwoViewState) -> tuple[Array, Array]:
@@ -566,16 +445,18 @@ class Estimation:
             inliers=refined.inliers,
             covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)],
-            model=self.mode.model.name,
-            velocity_sigma=refined.velocity_sigma,
             baseline=baseline,
             baseline_log_sigma=baseline_sigma,
-            baseline_reason=reason,
             images=images,
-            inertial_evidence=self._evidence(images),
-            iterations=self.iterations,
-            residual_rms=float(np.sqrt(np.mean(r**2))),
-            pixel_sigma=refined.sigma,
+            diagnostics=Diagnostics(
+                model=self.mode.model.name,
+                iterations=self.iterations,
+                residual_rms=float(np.sqrt(np.mean(r**2))),
+                pixel_sigma=refined.sigma,
+                velocity_sigma=refined.velocity_sigma,
+                baseline_reason=reason,
+                inertial_evidence=self._evidence(images),
+            ),
         )
 
     def _images(self, refined: Refined) -> covariance.ImageInformation | None:
@@ -633,14 +514,31 @@ class Estimation:
             )
         return math.exp(log_baseline), sigma, ''
 
-    def _failure(self, status: Status, reason: str) -> RelativePose:
+    def _failure(
+        self, status: Status, reason: str, rejected: RelativePose | None = None
+    ) -> RelativePose:
         return RelativePose(
             status=status,
             reason=reason,
-            model=self.mode.model.name,
-            iterations=self.iterations,
             inliers=np.zeros(len(self.problem.valid), dtype=bool),
+            diagnostics=Diagnostics(
+                model=self.mode.model.name, iterations=self.iterations, rejected=rejected
+            ),
         )
+
+
+def _mode(pair: PairProblem) -> SolverMode:
+    """Mode of the solver; it may need gravity."""
+    name = pair.config.solver
+    mode = sampling.MODES[name]
+    if mode.needs_gravity and (
+        pair.motions[0].gravity is None or pair.motions[-1].gravity is None
+    ):
+        raise InputError(
+            f'solver {name!r} requires gravity in both frames; without it, '
+            'use auto, uniform_11pt or angular_5pt'
+        )
+    return mode
 
 
 def _priors(

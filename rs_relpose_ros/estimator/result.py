@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +31,63 @@ class Status(str, Enum):
     WITHHELD = 'WITHHELD'  # a configured parameter of camera or IMU contradicts the data
 
 
-def _nan(*shape: int) -> Array:
-    return np.full(shape, np.nan)
+def _nan(*shape: int) -> Callable[[], Array]:
+    """Maker of an array of NaN, for the default of a field."""
+    return lambda: np.full(shape, math.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnostics:
+    """How a pose was estimated.
+
+    Attributes
+    ----------
+    model : str
+        'uniform', 'angular', 'linear' or 'global'.
+    iterations : int
+        Hypothesis samples drawn.
+    residual_rms : float
+        Root mean square Sampson error of the inliers [px].
+    pixel_sigma : float
+        Noise of a match as estimated from the residuals, 1 sigma per coordinate [px].
+    velocity_sigma : float
+        Prior sigma of the linear velocities that was used [baselines per second].
+    frames : int
+        Number of views that the pose was estimated from; 2 without frames between.
+    frames_reason : str
+        Why given frames between were not used; empty if they were.
+    gyro_square : float
+        Chi-square of the rotation from all frames by that of the gyro, 3 degrees of freedom.
+    baseline_reason : str
+        Why the baseline is not known; empty if it is, and without a pose.
+    inertial_evidence : InertialEvidence or None
+        Whether the images are consistent with the given acceleration (`inertial`); None if that
+        is not observable.
+    rejected : RelativePose or None
+        The estimate of two views that images and gyro contradict; then the pose is falsy.
+    duration : float
+        Time of the estimate [s].
+    """
+
+    model: str = ''
+    iterations: int = 0
+    residual_rms: float = math.nan
+    pixel_sigma: float = math.nan
+    velocity_sigma: float = math.nan
+    frames: int = 2
+    frames_reason: str = ''
+    gyro_square: float = math.nan
+    baseline_reason: str = ''
+    inertial_evidence: InertialEvidence | None = None
+    rejected: RelativePose | None = None
+    duration: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
     """Pose of camera 2 in camera 1, ``X1 = R X2 + t`` with ``|t| = 1``; falsy without a pose.
+
+    The attributes of `diagnostics` are also attributes of the pose.
 
     Attributes
     ----------
@@ -47,84 +99,50 @@ class RelativePose:
         ``R_1^T R_2``, between the two frames' reference rows.
     t : (3,) ndarray
         Unit direction of ``R_1^T (p_2 - p_1)``; NaN if not known.
+    covariance : (6, 6) ndarray
+        Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
+        ``R_true = Exp(dtheta) R``, both in camera 1; NaN where `t` or `R` is.
     linear_velocity1, linear_velocity2 : (3,) ndarray
         Each in its own camera's frame [baselines per second].
     linear_velocity1_covariance : (3, 3) ndarray
         In camera 1; NaN without frames between.
     angular_velocity1, angular_velocity2 : (3,) ndarray
         As corrected by the estimate [rad/s], each in its own camera's frame.
-    inliers : (N,) ndarray of bool
-        One per match.
-    covariance : (6, 6) ndarray
-        Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
-        ``R_true = Exp(dtheta) R``, both in camera 1; NaN where `t` or `R` is.
     velocity_covariance : (6, 6) ndarray
         Of `linear_velocity2` and `angular_velocity2`, in camera 2; NaN if they are not known.
-    model : str
-        'uniform', 'angular', 'linear' or 'global'.
     baseline : float
         Length of the translation [m]; NaN if not known: not observable from images and gyro.
     baseline_log_sigma : float
         1 sigma of its logarithm.
-    baseline_reason : str
-        Why the baseline is not known; empty if it is, and without a pose.
+    inliers : (N,) ndarray of bool
+        One per match.
     images : ImageInformation or None
         Information of the images alone, without the priors of the IMU; None if there is none.
-    inertial_evidence : InertialEvidence or None
-        Whether the images are consistent with the given acceleration (`inertial`); None if that
-        is not observable.
-    rejected : RelativePose or None
-        The estimate of two views that images and gyro contradict; then this one is falsy.
     pixels1_gs, pixels2_gs : (N, 2) ndarray or None
         Equivalent global-shutter pixels of the matches at the times of the reference rows, on the
         sensor: NaN for outliers; None unless requested, and without a pose.
-    velocity_sigma : float
-        Prior sigma of the linear velocities that was used [baselines per second].
-    iterations : int
-        Hypothesis samples drawn.
-    residual_rms : float
-        Root mean square Sampson error of the inliers [px].
-    frames : int
-        Number of views that the pose was estimated from; 2 without frames between.
-    frames_reason : str
-        Why given frames between were not used; empty if they were.
-    gyro_square : float
-        Chi-square of the rotation from all frames by that of the gyro, 3 degrees of freedom.
-    pixel_sigma : float
-        Noise of a match as estimated from the residuals, 1 sigma per coordinate [px].
-    duration : float
-        Time of the estimate [s].
+    diagnostics : Diagnostics
+        How the pose was estimated.
     """
 
     status: Status
     reason: str = ''
-    R: Array = field(default_factory=lambda: _nan(3, 3))
-    t: Array = field(default_factory=lambda: _nan(3))
-    linear_velocity1: Array = field(default_factory=lambda: _nan(3))
-    linear_velocity1_covariance: Array = field(default_factory=lambda: _nan(3, 3))
-    linear_velocity2: Array = field(default_factory=lambda: _nan(3))
-    angular_velocity1: Array = field(default_factory=lambda: _nan(3))
-    angular_velocity2: Array = field(default_factory=lambda: _nan(3))
+    R: Array = field(default_factory=_nan(3, 3))
+    t: Array = field(default_factory=_nan(3))
+    covariance: Array = field(default_factory=_nan(6, 6))
+    linear_velocity1: Array = field(default_factory=_nan(3))
+    linear_velocity1_covariance: Array = field(default_factory=_nan(3, 3))
+    linear_velocity2: Array = field(default_factory=_nan(3))
+    angular_velocity1: Array = field(default_factory=_nan(3))
+    angular_velocity2: Array = field(default_factory=_nan(3))
+    velocity_covariance: Array = field(default_factory=_nan(6, 6))
+    baseline: float = math.nan
+    baseline_log_sigma: float = math.nan
     inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    covariance: Array = field(default_factory=lambda: _nan(6, 6))
-    velocity_covariance: Array = field(default_factory=lambda: _nan(6, 6))
-    model: str = ''
-    baseline: float = float('nan')
-    baseline_log_sigma: float = float('nan')
-    baseline_reason: str = ''
     images: ImageInformation | None = None
-    rejected: RelativePose | None = None
-    inertial_evidence: InertialEvidence | None = None
     pixels1_gs: Array | None = None
     pixels2_gs: Array | None = None
-    velocity_sigma: float = float('nan')
-    iterations: int = 0
-    residual_rms: float = float('nan')
-    frames: int = 2
-    frames_reason: str = ''
-    gyro_square: float = float('nan')
-    pixel_sigma: float = float('nan')
-    duration: float = float('nan')
+    diagnostics: Diagnostics = Diagnostics()
 
     def __bool__(self) -> bool:
         """Whether there is a pose."""
@@ -145,29 +163,34 @@ class RelativePose:
         """`linear_velocity2` (3,) in m/s; NaN if the baseline is not known."""
         return self.baseline * self.linear_velocity2
 
+    def diagnosed(self, **changes: Any) -> RelativePose:
+        """The same with other `diagnostics`."""
+        return replace(self, diagnostics=replace(self.diagnostics, **changes))
+
     def without_translation(self, status: Status, reason: str) -> RelativePose:
         """The same with the rotation alone, and the reason."""
-        covariance, velocity_covariance = self.covariance.copy(), self.velocity_covariance.copy()
+        covariance = self.covariance.copy()
+        velocity_covariance = self.velocity_covariance.copy()
         for matrix in (covariance, velocity_covariance):
             matrix[:3] = matrix[:, :3] = np.nan
+        nothing = RelativePose(status)
         return replace(
             self.without_baseline(''),
             status=status,
             reason=reason,
-            t=_nan(3),
-            linear_velocity1=_nan(3),
-            linear_velocity1_covariance=_nan(3, 3),
-            linear_velocity2=_nan(3),
+            t=nothing.t,
             covariance=covariance,
-            images=None if self.images is None else self.images.of_rotation(),
+            linear_velocity1=nothing.linear_velocity1,
+            linear_velocity1_covariance=nothing.linear_velocity1_covariance,
+            linear_velocity2=nothing.linear_velocity2,
             velocity_covariance=velocity_covariance,
+            images=None if self.images is None else self.images.of_rotation(),
         )
 
     def without_baseline(self, reason: str) -> RelativePose:
         """The same without a baseline, and the reason."""
-        return replace(
-            self, baseline=float('nan'), baseline_log_sigma=float('nan'), baseline_reason=reason
-        )
+        unknown = replace(self, baseline=math.nan, baseline_log_sigma=math.nan)
+        return unknown.diagnosed(baseline_reason=reason)
 
     def inverse(self) -> RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly.
@@ -181,22 +204,83 @@ class RelativePose:
         covariance = jacobian @ self.covariance @ jacobian.T
         # Known without a translation, too, whose NaN spreads through the product.
         covariance[3:, 3:] = R_inv @ self.covariance[3:, 3:] @ self.R
-        return replace(
-            self,
+        return RelativePose(
+            self.status,
+            self.reason,
             R=R_inv,
             t=-R_inv @ self.t,
+            covariance=covariance,
             linear_velocity1=self.linear_velocity2,
-            linear_velocity1_covariance=_nan(3, 3),
             linear_velocity2=self.linear_velocity1,
             angular_velocity1=self.angular_velocity2,
             angular_velocity2=self.angular_velocity1,
-            covariance=covariance,
-            velocity_covariance=_nan(6, 6),
-            images=None,
-            inertial_evidence=None,
-            pixels1_gs=None,
-            pixels2_gs=None,
+            baseline=self.baseline,
+            baseline_log_sigma=self.baseline_log_sigma,
+            inliers=self.inliers,
+            diagnostics=replace(self.diagnostics, inertial_evidence=None),
         )
+
+    # Attributes of earlier releases, now of `diagnostics`.
+
+    @property
+    def model(self) -> str:
+        """Model of the estimate."""
+        return self.diagnostics.model
+
+    @property
+    def iterations(self) -> int:
+        """Hypothesis samples drawn."""
+        return self.diagnostics.iterations
+
+    @property
+    def residual_rms(self) -> float:
+        """Root mean square residual [px]."""
+        return self.diagnostics.residual_rms
+
+    @property
+    def pixel_sigma(self) -> float:
+        """Noise of a match [px]."""
+        return self.diagnostics.pixel_sigma
+
+    @property
+    def velocity_sigma(self) -> float:
+        """Prior sigma of the velocities [baselines per second]."""
+        return self.diagnostics.velocity_sigma
+
+    @property
+    def frames(self) -> int:
+        """Number of views."""
+        return self.diagnostics.frames
+
+    @property
+    def frames_reason(self) -> str:
+        """Why given frames between were not used."""
+        return self.diagnostics.frames_reason
+
+    @property
+    def gyro_square(self) -> float:
+        """Chi-square of the rotation by the gyro's."""
+        return self.diagnostics.gyro_square
+
+    @property
+    def baseline_reason(self) -> str:
+        """Why the baseline is not known."""
+        return self.diagnostics.baseline_reason
+
+    @property
+    def inertial_evidence(self) -> InertialEvidence | None:
+        """Consistency of the images with the acceleration."""
+        return self.diagnostics.inertial_evidence
+
+    @property
+    def rejected(self) -> RelativePose | None:
+        """The estimate that images and gyro contradict."""
+        return self.diagnostics.rejected
+
+    @property
+    def duration(self) -> float:
+        """Time of the estimate [s]."""
+        return self.diagnostics.duration
 
 
 # -- Landmarks and equivalent global-shutter pixels -----------------------------------------------
@@ -208,12 +292,14 @@ class RelativePose:
 #
 # which determines both distances l by least squares.
 
-# Squared sine of the angle below which rays are parallel: 2e-4 rad, a tenth of a pixel.
+# Squared sine of the angle below which rays count as parallel, and their point as infinitely far
+# away: an angle of 2e-4 rad is a tenth of a pixel, so that such a distance is noise. A larger
+# value would lose far landmarks. [derived: 0.1 px at a focal length of 500 px]
 _PARALLEL = 4e-8
 
 
 class Landmarks(NamedTuple):
-    """Of the N matches of a pair with a pose; NaN for outliers."""
+    """Points of the N matches of a pair with a pose; NaN for outliers."""
 
     # (N, 2) equivalent global-shutter pixels at the times of the stamped rows
     pixels1: Array
@@ -224,29 +310,29 @@ class Landmarks(NamedTuple):
 
 
 def landmarks(
-    pose: RelativePose,
-    rays1: Array,
-    rays2: Array,
-    row_times1: Array,
-    row_times2: Array,
-    camera: RollingShutterCamera,
+    pose: RelativePose, rays: Array, row_times: Array, camera: RollingShutterCamera
 ) -> Landmarks:
     """Landmarks of the inliers of a pose, pixels on the sensor.
 
-    `rays*` (N, 3): unit rays of the matches, derotated to the stamped row of their frame.
-    `row_times*` (N,): of the matches, from that of the stamped row [s].
+    `rays` (2, N, 3): unit rays of the matches, derotated to the stamped row of their frame.
+    `row_times` (2, N): of the matches, from that of the stamped row [s].
     """
     inliers = pose.inliers
-    f1, f2 = rays1[inliers], rays2[inliers]
-    moved1 = row_times1[inliers, None] * pose.linear_velocity1
-    moved2 = row_times2[inliers, None] * pose.linear_velocity2
+    f1, f2 = rays.compress(inliers, axis=1)
+    times1, times2 = row_times[:, inliers, None]
+    moved1 = times1 * pose.linear_velocity1
+    moved2 = times2 * pose.linear_velocity2
     in_first = f2 @ pose.R.T
-    l1, l2, near = depths_of_rays(f1, in_first, pose.t + moved2 @ pose.R.T - moved1, _PARALLEL)
+    baselines = pose.t + moved2 @ pose.R.T - moved1
+    l1, l2, near = depths_of_rays(f1, in_first, baselines, _PARALLEL)
     # Inverse distances: 0 at infinity.
     equal1 = f1 + (near / l1)[:, None] * moved1
     equal2 = f2 + (near / l2)[:, None] * moved2
-    middle = 0.5 * (l1[:, None] * equal1 + pose.t + (l2[:, None] * equal2) @ pose.R.T)
+    point1 = l1[:, None] * equal1
+    point2 = pose.t + (l2[:, None] * equal2) @ pose.R.T
+    middle = 0.5 * (point1 + point2)
     out = Landmarks(*(np.full((len(inliers), size), np.nan) for size in (2, 2, 3)))
-    out.pixels1[inliers], out.pixels2[inliers] = camera.project(equal1), camera.project(equal2)
+    out.pixels1[inliers] = camera.project(equal1)
+    out.pixels2[inliers] = camera.project(equal2)
     out.points[inliers] = np.where(near[:, None], middle, np.nan)
     return out

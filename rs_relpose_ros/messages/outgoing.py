@@ -154,7 +154,7 @@ PAIR_VALUES = {
         ),
         PairValue('status', 'text', lambda pair: pair.pose.status.value, 'status'),
         PairValue('reason', 'text', lambda pair: pair.pose.reason, 'reason'),
-        PairValue('model', 'text', lambda pair: pair.pose.model),
+        PairValue('model', 'text', lambda pair: pair.pose.diagnostics.model),
         *(PairValue(metric.name, 'real', metric.of) for metric in PAIR_METRICS),
         PairValue('baseline_m', 'real', lambda pair: pair.pose.baseline, 'baseline'),
         PairValue(
@@ -163,7 +163,7 @@ PAIR_VALUES = {
             lambda pair: pair.pose.baseline_log_sigma,
             'baseline_log_sigma',
         ),
-        PairValue('baseline_reason', 'text', lambda pair: pair.pose.baseline_reason),
+        PairValue('baseline_reason', 'text', lambda pair: pair.pose.diagnostics.baseline_reason),
         # Of the current camera in its own frame.
         PairValue(
             'linear_velocity_m_s',
@@ -303,10 +303,10 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     for names, values in (
         ('u1 v1', result.matches.points1),
         ('u2 v2', result.matches.points2),
-        ('tau1', result.row_times1[:, None]),
-        ('tau2', result.row_times2[:, None]),
-        ('x1 y1 z1', result.rays1),
-        ('x2 y2 z2', result.rays2),
+        ('tau1', result.matches.row_times[0][:, None]),
+        ('tau2', result.matches.row_times[1][:, None]),
+        ('x1 y1 z1', result.matches.rays[0]),
+        ('x2 y2 z2', result.matches.rays[1]),
         ('x y z', found.points),
         ('u1_gs v1_gs', found.pixels1),
         ('u2_gs v2_gs', found.pixels2),
@@ -622,7 +622,9 @@ def draw_pair(result: PairResult) -> Color:
         cv2.circle(canvas, end, 2 << _SHIFT, color, -1, cv2.LINE_AA, _SHIFT)
     if len(points2) and np.ptp(points2[:, 1]) >= 1.0:
         canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
-        times = np.polyval(np.polyfit(points2[:, 1], result.row_times2, 1), (0, height - 1))
+        times = np.polyval(
+            np.polyfit(points2[:, 1], result.matches.row_times[1], 1), (0, height - 1)
+        )
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
             cv2.putText(
                 canvas,
@@ -636,7 +638,9 @@ def draw_pair(result: PairResult) -> Color:
             )
     pose = result.pose
     model, residual = (
-        (f' {pose.model}', f', residual {pose.residual_rms:.2f} px') if pose else ('', '')
+        (f' {pose.diagnostics.model}', f', residual {pose.diagnostics.residual_rms:.2f} px')
+        if pose
+        else ('', '')
     )
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
     cv2.putText(

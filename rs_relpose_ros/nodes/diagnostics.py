@@ -388,7 +388,7 @@ class Statistics(FrameStatistics):
             'pairs': self._pairs,
             'poses': self._poses,
             **{metric.name: metric.text(last) for metric in PAIR_METRICS},
-            'model': pose.pose.model if pose else '',
+            'model': pose.pose.diagnostics.model if pose else '',
             **tracked,
             'health': (NOT_EVALUATED if last is None else last.health).state.value,
             'health_findings': (NOT_EVALUATED if last is None else last.health).text,

@@ -51,7 +51,7 @@ class KeyframeObservations(ArrayFile):
         """Observations in both images of a pair."""
         found, matches = pair.pose.inliers, pair.matches
         ids = matches.track_ids[found].astype(np.int64)
-        delays = np.concatenate([pair.row_times1[found], pair.row_times2[found]])
+        delays = np.concatenate([times[found] for times in matches.row_times])
         keyframes = np.repeat([pair.reference_ns1, pair.reference_ns2], len(ids))
         return cls(
             ids=np.tile(ids, 2),

@@ -276,7 +276,9 @@ def _summary(
             'wall_s': run.seconds,
             'frame_rate_hz': taken / seconds if seconds > 0.0 else None,
             'processing_per_frame_ms': 1e3 * seconds / taken if taken else None,
-            'estimate_median_ms': median([1e3 * record.pose.duration for record in records]),
+            'estimate_median_ms': median(
+                [1e3 * record.pose.diagnostics.duration for record in records]
+            ),
         },
     }
 

@@ -81,7 +81,7 @@ def _pose_row(record: PairRecord) -> list[str]:
         *map(number, values),
         number(record.metrics['inliers']),
         matches,
-        pose.model,
+        pose.diagnostics.model,
         pose.status.value,
         number(pose.baseline),
         number(pose.baseline_log_sigma),
@@ -203,8 +203,8 @@ def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
     """Number of poses with a metric baseline, its median sigma, and the reasons of the others."""
     known, reasons = [], ReasonCounts()
     for record in answered:
-        if record.pose.baseline_reason:
-            reasons.add(record.pose.baseline_reason)
+        if record.pose.diagnostics.baseline_reason:
+            reasons.add(record.pose.diagnostics.baseline_reason)
         else:
             known.append(record.pose.baseline_log_sigma)
     return {

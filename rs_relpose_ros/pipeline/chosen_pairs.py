@@ -12,6 +12,7 @@ from typing import Any
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.estimator.estimate import estimate
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
@@ -96,48 +97,28 @@ def estimate_wide_pair(
             'the intrinsics changed between the two frames: one calibration must hold for both'
         )
     sensor = sensor_model(first.intrinsics, parameters.sensor)
-    tracking = parameters.tracking  # KLT has no descriptors
-    tracker = DescriptorTracker(
-        replace(tracking, detector='sift') if tracking.detector == 'klt' else tracking
-    )
+    tracking = parameters.tracking
+    if tracking.detector == 'klt':  # it has no descriptors
+        tracking = replace(tracking, detector='sift')
+    tracker = DescriptorTracker(tracking)
     tracker.start(first.image)
-    gyro = _gyro(first, second)
+    since = _since(first, second)
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
-    inertial = (
-        pair.inertial_of(first.imu, second.imu, gyro, parameters)
-        if near
-        else ('the frames are further apart than max_keyframe_interval')
-    )
-    history = TrackHistory(first.imu)
-    if gyro is not None and near:
+    history = TrackHistory(first.stamp_ns, first.imu)
+    if since is not None and near:
         for frame in used_frames(between):
-            rotation = _gyro(first, frame)
-            if rotation is not None and frame.intrinsics == first.intrinsics:
-                history.add(frame.imu, rotation, tracker.track(frame.image))
+            to_frame = _since(first, frame)
+            if to_frame is not None and frame.intrinsics == first.intrinsics:
+                history.add(frame.imu, to_frame, tracker.track(frame.image))
     matches = tracker.track(second.image)
-    if gyro is not None:
-        history.add(second.imu, gyro, matches)
-    pose = pair.estimate_pair(
-        first.imu,
-        second.imu,
-        (first.stamp_ns, second.stamp_ns),
-        matches,
-        sensor,
-        gyro,
-        inertial,
-        parameters,
-        interval=interval if near else None,
-        between=() if gyro is None else history.between(matches, sensor, inertial),
-    )
-    rays1, rays2 = (
-        pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
-        for points, frame in ((matches.points1, first), (matches.points2, second))
-    )
-    return pair.pair_result(first, second, matches, rays1, rays2, pose, gyro, sensor, parameters)
+    history.add(second.imu, since, matches)
+    pose = estimate(history.problem(second.stamp_ns, matches, sensor, parameters, near=near))
+    rays = pair.derotated(matches, first.imu.motion, second.imu.motion, sensor)
+    return history.result(second, rays, pose, sensor, parameters)
 
 
-def _gyro(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
+def _since(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
     """The IMU since the first frame; None if the frame's samples begin at another one."""
     since = frame.imu.since_previous
     if since is None or since.stamps_ns[0] != first.imu.reference_ns:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.config.settings import SensorConfig
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
@@ -161,10 +161,12 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
         status=Status.WITHHELD,
         reason=health.faults[0].text,
         inliers=pose.inliers,
-        model=pose.model,
-        iterations=pose.iterations,
-        residual_rms=pose.residual_rms,
-        duration=pose.duration,
+        diagnostics=Diagnostics(
+            model=pose.diagnostics.model,
+            iterations=pose.diagnostics.iterations,
+            residual_rms=pose.diagnostics.residual_rms,
+            duration=pose.diagnostics.duration,
+        ),
     )
 
 
@@ -208,7 +210,7 @@ class Agreement:
         prior = 2.0 * _PRIOR_PAIRS
         # The second factor: of a rotation that contradicts the gyro, as with two views.
         factor = max((prior + self._squares) / (prior + self._freedom), 1.0) * max(
-            (1.0 + estimated.gyro_square) / 4.0, 1.0
+            (1.0 + estimated.diagnostics.gyro_square) / 4.0, 1.0
         )
         if factor == 1.0:
             return assessed

@@ -1,4 +1,4 @@
-"""Frames and pairs of them: the camera model, rays, the measurements of a pair, its result.
+"""Frames and pairs of them: rays, the problem of a pair for the estimator, its result.
 
 The same functions serve keyframe pairs, whose corners were tracked (`pipeline.py`), and chosen
 frames at any interval (`chosen_pairs.py`).
@@ -17,22 +17,23 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator import velocity
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose
-from rs_relpose_ros.estimator.frames_between import IntermediateFrame
-from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
 from rs_relpose_ros.geometry.timing import seconds_between, Sensor, to_nanoseconds
-from rs_relpose_ros.imu import integration
-from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, motions_on_the_way
+from rs_relpose_ros.imu.integration import (
+    FrameImu,
+    ImuSlice,
+    inertial_motion,
+    motions_on_the_way,
+)
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
-from rs_relpose_ros.tracking.features import Matches
 from rs_relpose_ros.tracking.images import EncodedImage, is_dark
 
 Result = TypeVar('Result')
@@ -127,11 +128,7 @@ class PairResult:
     frame_id: str  # of the current image
     interval: float  # [s] between the two reference times
     pose: RelativePose  # its inliers are a mask over `matches`
-    matches: Matches  # pixels of the published images
-    row_times1: Array  # (N,) [s] from the stamped row
-    row_times2: Array
-    rays1: Array  # (N, 3) unit, derotated by the gyro to the stamped row
-    rays2: Array
+    matches: Matches  # derotated, in pixels of the published images
     parallax: float  # [px] median after derotation
     landmarks_of: Callable[[], Landmarks] | None = None  # None without a pose
     gyro_rotation: Array | None = None  # (3, 3) R_1^T R_2 integrated from the gyro
@@ -164,23 +161,23 @@ class PairMetric(NamedTuple):
     digits: int  # after the point, on /diagnostics
 
     def text(self, pair: PairResult | None) -> str:
-        """As on /diagnostics."""
+        """The value as on /diagnostics."""
         value = math.nan if pair is None else self.of(pair)
         return '' if math.isnan(value) else f'{value:.{self.digits}f}'
+
+
+def _inliers(pair: PairResult) -> int:
+    return int(np.count_nonzero(pair.pose.inliers))
 
 
 # The one list for topics, /diagnostics and files.
 PAIR_METRICS = (
     PairMetric('matches', lambda pair: len(pair.matches), 0),
-    PairMetric('inliers', lambda pair: int(np.count_nonzero(pair.pose.inliers)), 0),
-    PairMetric(
-        'inlier_ratio',
-        lambda pair: np.count_nonzero(pair.pose.inliers) / max(len(pair.matches), 1),
-        3,
-    ),
+    PairMetric('inliers', _inliers, 0),
+    PairMetric('inlier_ratio', lambda pair: _inliers(pair) / max(len(pair.matches), 1), 3),
     PairMetric('parallax_px', lambda pair: pair.parallax, 1),
-    PairMetric('residual_rms_px', lambda pair: pair.pose.residual_rms, 2),
-    PairMetric('pixel_sigma_px', lambda pair: pair.pose.pixel_sigma, 3),
+    PairMetric('residual_rms_px', lambda pair: pair.pose.diagnostics.residual_rms, 2),
+    PairMetric('pixel_sigma_px', lambda pair: pair.pose.diagnostics.pixel_sigma, 3),
     PairMetric('interval_s', lambda pair: pair.interval, 3),
     PairMetric('rotation_difference_to_gyro_deg', lambda pair: pair.gyro_difference, 3),
 )
@@ -188,35 +185,27 @@ PAIR_METRICS = (
 
 # -- Rays of tracked points -----------------------------------------------------------------
 
-Ids = NDArray[np.uint32]
 
+def derotated(
+    matches: Matches,
+    motion1: FrameMotion,
+    motion2: FrameMotion,
+    sensor: Sensor,
+    known: Matches | None = None,
+) -> Matches:
+    """The matches of two published images with their rays and row times.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DerotatedRays:
-    """Points of one image with their derotated rays."""
-
-    track_ids: Ids  # (N,)
-    points: Array  # (N, 2) pixels of the published image
-    rays: Array  # (N, 3) unit, in the camera frame of the stamped row
-    row_times: Array  # (N,) [s] from the stamped row
-
-    @classmethod
-    def from_points(
-        cls, track_ids: Ids, points: Array, sensor: Sensor, motion: FrameMotion
-    ) -> DerotatedRays:
-        """Rays of points (N, 2) of a published image."""
-        return cls(track_ids, points, *sensor.derotated(points, motion))
-
-    def of(self, track_ids: Ids) -> DerotatedRays | None:
-        """Those of some of the tracks, in the same order; None if one is missing."""
-        rows = positions(self.track_ids, track_ids)
-        if len(rows) < len(track_ids):
-            return None
-        if len(rows) == len(self.track_ids):
-            return self
-        return DerotatedRays(
-            self.track_ids[rows], self.points[rows], self.rays[rows], self.row_times[rows]
-        )
+    Points of the reference image do not move: their rays are taken from `known`, derotated
+    matches with the same reference, if it has all of the tracks.
+    """
+    rows = None if known is None else positions(known.track_ids, matches.track_ids)
+    if known is not None and rows is not None and len(rows) == len(matches):
+        rays1 = known.rays[0][rows]
+        times1 = known.row_times[0][rows]
+    else:
+        rays1, times1 = sensor.derotated(matches.points1, motion1)
+    rays2, times2 = sensor.derotated(matches.points2, motion2)
+    return replace(matches, rays=np.stack([rays1, rays2]), row_times=np.stack([times1, times2]))
 
 
 @kernel
@@ -250,11 +239,11 @@ def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
     return median(values[:count]) if count else 0.0
 
 
-# -- Measurements of a pair, given to the estimator -----------------------------------------
-
-# Largest 1 sigma of the gravity direction that the estimator accepts [rad].
-_LARGEST_GRAVITY_SIGMA = 1.5
-_LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
+def parallax_of(matches: Matches, since: ImuSlice | None, sensor: Sensor) -> float:
+    """Median parallax [px] of derotated matches, with the gyro's rotation between the frames."""
+    rays1, rays2 = matches.rays
+    rotation = aligning_rotation(rays1.T @ rays2) if since is None else since.rotation
+    return sensor.camera.fx * median_parallax(rays1, rays2, rotation)
 
 
 def interval_of(first: FrameImu, second: FrameImu) -> float:
@@ -262,12 +251,179 @@ def interval_of(first: FrameImu, second: FrameImu) -> float:
     return seconds_between(first.reference_ns, second.reference_ns)
 
 
+# -- From the frames since a reference to the problem of a pair, and to its result ------------
+
+# Largest 1 sigma of the gravity direction that the estimator accepts [rad]. With it, gravity no
+# longer has an effect. [derived: the range of the parameter gravity_sigma]
+_LARGEST_GRAVITY_SIGMA = 1.5
+# Most frames between that are used, evenly in the pair. More of them cost time and add hardly any
+# accuracy; with three, the largest errors of long pairs were a quarter larger on recordings.
+# [measured: recordings, together with the removal of observations far from a first result]
+MOST_FRAMES = 5
+_LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
+
+
+def used_frames(between: Sequence[Frames]) -> list[Frames]:
+    """Choose the intermediate frames that the estimate of a pair uses."""
+    places = np.linspace(-1, len(between), min(len(between), MOST_FRAMES) + 2)[1:-1]
+    return [between[k] for k in np.round(places).astype(int)]
+
+
+class TrackHistory:
+    """The frames since a reference keyframe, and the pair that the last one makes with it."""
+
+    def __init__(self, stamp_ns: int, imu: FrameImu) -> None:
+        """Begin at a reference keyframe, with its stamp and IMU data."""
+        self.stamp_ns = stamp_ns
+        self.imu = imu
+        # IMU data of each frame, samples of the IMU since the reference, tracks.
+        self._frames: list[tuple[FrameImu, ImuSlice | None, Matches]] = []
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def since(self) -> ImuSlice | None:
+        """The IMU from the reference to the last frame; None without a frame, or with a gap."""
+        return self._frames[-1][1] if self._frames else None
+
+    def add(self, imu: FrameImu, since: ImuSlice | None, matches: Matches) -> None:
+        """Add the current frame with the samples since the reference and with its tracks."""
+        self._frames.append((imu, since, matches))
+
+    def problem(
+        self,
+        stamp_ns: int,
+        matches: Matches,
+        sensor: Sensor,
+        parameters: Parameters,
+        *,
+        near: bool = True,
+        stamp_sigma: float = 0.0,
+    ) -> PairProblem:
+        """All that is known of the pair of the reference and the last frame, of `stamp_ns`.
+
+        `matches` are refined tracks of the pair. `near`: whether the interval constrains the
+        velocities, and frames between are used. `stamp_sigma` [s]: scatter of the stamps, used
+        if it is larger than the parameter. The stamps of both frames and the parameter `seed`
+        seed the random samples.
+        """
+        use_gyro = parameters.pair.use_gyro_rotation and self.since is not None
+        between = used_frames(self._frames[:-1]) if near and use_gyro else []
+        last = self._frames[-1]
+        imus = [self.imu, *(imu for imu, _, _ in (*between, last))]
+        slices = [since for _, since, _ in (*between, last)] if use_gyro else [None]
+        reason, motions = self._accelerations(imus, near, parameters)
+        motion1, motion2, gravity_sigma = _with_gravity(imus[0], imus[-1], parameters)
+        seconds = np.array([interval_of(self.imu, imu) for imu in imus])
+        if not near:
+            seconds[-1] = math.nan
+        points = [matches.points1, *self._drifted(matches, between), matches.points2]
+        on_sensor = sensor.intrinsics.to_sensor(np.concatenate(points))
+        seed = parameters.pair.seed, self.stamp_ns, stamp_ns
+        configured = parameters.estimator
+        return PairProblem(
+            replace(matches, points=on_sensor.reshape(len(imus), -1, 2)),
+            sensor.camera,
+            (motion1, *(imu.motion for imu in imus[1:-1]), motion2),
+            seconds,
+            np.stack([np.eye(3), *(_UNKNOWN if one is None else one.rotation for one in slices)]),
+            np.stack(
+                [
+                    np.zeros((3, 3)),
+                    *(_UNKNOWN if one is None else one.covariance for one in slices),
+                ]
+            ),
+            motions,
+            validate.replaced(
+                configured,
+                gravity_sigma=gravity_sigma,
+                stamp_sigma=max(configured.stamp_sigma, stamp_sigma),
+            ),
+            int(np.random.default_rng(seed).integers(2**63)),
+            reason,
+        )
+
+    def _accelerations(
+        self, imus: Sequence[FrameImu], near: bool, parameters: Parameters
+    ) -> tuple[str, tuple[InertialMotion | None, ...]]:
+        """Why the accelerometer is not used, or empty; and the motion up to each frame."""
+        unknown: tuple[None, ...] = (None,) * len(imus)
+        if not near:
+            return 'the frames are further apart than max_keyframe_interval', unknown
+        whole = inertial_of(imus[0], imus[-1], self.since, parameters)
+        if isinstance(whole, str):
+            return whole, unknown
+        assert self.since is not None
+        on_the_way = motions_on_the_way(whole, imus[0], self.since, imus[1:-1])
+        return '', (None, *on_the_way, whole)
+
+    # Each step of a tracker adds its error, and the windows of a pair's last frame are aligned
+    # with those of its first one: the drift of a track is known there. The drift of an earlier
+    # frame is interpolated linearly in time: that is the expected value of a random walk whose
+    # two ends are known.
+
+    def _drifted(
+        self, matches: Matches, between: Sequence[tuple[FrameImu, ImuSlice | None, Matches]]
+    ) -> list[Array]:
+        """Points (N, 2) of a pair's refined `matches` in frames between the two."""
+        last, _, tracked = self._frames[-1]
+        drift = matches.points2 - _points(tracked, matches)
+        interval = interval_of(self.imu, last)
+        return [
+            _points(tracks, matches) + interval_of(self.imu, imu) / interval * drift
+            for imu, _, tracks in between
+        ]
+
+    def result(
+        self,
+        frame: Frame[Any],
+        matches: Matches,
+        pose: RelativePose,
+        sensor: Sensor,
+        parameters: Parameters,
+    ) -> PairResult:
+        """The pair of the reference and `frame`, the last one, with its pose.
+
+        `matches` are derotated.
+        """
+        since = self.since
+        later_ns = to_nanoseconds(sensor.pose_row_delay)
+        if pose.status in _LACK_OF_MATCHES and is_dark(frame.image):
+            pose = replace(pose, reason=f'the image is dark: {pose.reason}')
+
+        @cache
+        def points() -> Landmarks:
+            found = landmarks(pose, matches.rays, matches.row_times, sensor.camera)
+            to_image = sensor.intrinsics.to_image  # pixels of the published images
+            return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
+
+        return PairResult(
+            reference_stamp_ns=self.stamp_ns + later_ns,
+            stamp_ns=frame.stamp_ns + later_ns,
+            reference_ns1=self.imu.reference_ns,
+            reference_ns2=frame.imu.reference_ns,
+            frame_id=frame.frame_id,
+            interval=interval_of(self.imu, frame.imu),
+            pose=pose,
+            matches=matches,
+            parallax=parallax_of(matches, since, sensor),
+            landmarks_of=points if pose else None,
+            gyro_rotation=None if since is None else since.rotation,
+            gyro_bias=None if since is None else parameters.sensor.R_cam_imu.T @ since.bias,
+        )
+
+
+# Of a frame whose rotation the gyro does not give.
+_UNKNOWN = np.full((3, 3), math.nan)
+
+
 def inertial_of(
     first: FrameImu, second: FrameImu, since: ImuSlice | None, parameters: Parameters
 ) -> InertialMotion | str:
     """Motion of a pair by the accelerometer, or the reason why it is not known.
 
-    `since` extends from the first frame to the second one.
+    `since`: the samples from the first frame to the second one.
     """
     if not parameters.pair.use_accelerometer:
         return 'use_accelerometer is false'
@@ -276,133 +432,7 @@ def inertial_of(
         return 'use_gyro_rotation is false'
     if since is None:
         return 'the gyro has a gap'
-    return integration.inertial_motion(since, first, second, parameters.imu)
-
-
-def estimate_pair(
-    first: FrameImu,
-    second: FrameImu,
-    stamps_ns: tuple[int, int],
-    matches: Matches,
-    sensor: Sensor,
-    gyro: ImuSlice | None,
-    inertial: InertialMotion | str,
-    parameters: Parameters,
-    *,
-    interval: float | None,
-    stamp_sigma: float = 0.0,
-    between: Sequence[IntermediateFrame] = (),
-) -> RelativePose:
-    """The relative pose of two frames from all that is known of them.
-
-    `stamps_ns`: of both; they and the parameter `seed` are that of the samples.
-    `interval` [s]: None if it does not constrain the velocities.
-    `stamp_sigma` [s]: scatter of the stamps, used if it is larger than the parameter.
-    `between`: the frames between the two.
-    """
-    configured = gyro if parameters.pair.use_gyro_rotation else None
-    motion1, motion2, gravity_sigma = _with_gravity(first, second, parameters)
-    pose = estimate_relative_pose(
-        sensor.intrinsics.to_sensor(matches.points1),
-        sensor.intrinsics.to_sensor(matches.points2),
-        sensor.camera,
-        motion1,
-        motion2,
-        relative_rotation=None if configured is None else configured.rotation,
-        relative_rotation_covariance=None if configured is None else configured.covariance,
-        interval=interval,
-        config=validate.replaced(
-            parameters.estimator,
-            gravity_sigma=gravity_sigma,
-            stamp_sigma=max(parameters.estimator.stamp_sigma, stamp_sigma),
-        ),
-        quality=matches.quality,
-        inertial=None if isinstance(inertial, str) else inertial,
-        between=() if configured is None or interval is None else between,
-        rng=np.random.default_rng([parameters.pair.seed, *stamps_ns]),
-    )
-    if isinstance(inertial, str):
-        pose = pose.without_baseline(f'baseline not known: {inertial}')
-    return pose
-
-
-def evidence_without(
-    pose: RelativePose,
-    first: FrameImu,
-    second: FrameImu,
-    sensor: Sensor,
-    gyro: ImuSlice,
-    inertial: InertialMotion,
-    parameters: Parameters,
-) -> velocity.InertialEvidence | None:
-    """Consistency of the images with an acceleration that was not used; None if not known."""
-    if pose.images is None:
-        return None
-    nothing, interval = np.empty((0, 2)), interval_of(first, second)
-    problem = build_problem(
-        nothing,
-        nothing,
-        sensor.camera,
-        first.motion,
-        second.motion,
-        gyro.rotation,
-        gyro.covariance,
-    )
-    motion = parameters.estimator.motion
-    expected, _ = velocity.expected_velocities(problem, motion, interval, inertial)
-    return velocity.inertial_evidence(problem, pose.images, motion, interval, expected)
-
-
-def parallax_of(
-    rays1: DerotatedRays, rays2: DerotatedRays, gyro: ImuSlice | None, sensor: Sensor
-) -> float:
-    """Median parallax [px] of matched rays after derotation."""
-    rotation = aligning_rotation(rays1.rays.T @ rays2.rays) if gyro is None else gyro.rotation
-    return sensor.camera.fx * median_parallax(rays1.rays, rays2.rays, rotation)
-
-
-def pair_result(
-    first: Frame[Any],
-    second: Frame[Any],
-    matches: Matches,
-    rays1: DerotatedRays,
-    rays2: DerotatedRays,
-    pose: RelativePose,
-    gyro: ImuSlice | None,
-    sensor: Sensor,
-    parameters: Parameters,
-) -> PairResult:
-    """The pair with its pose and the values derived from it."""
-    later_ns = to_nanoseconds(sensor.pose_row_delay)
-    if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
-        pose = replace(pose, reason=f'the image is dark: {pose.reason}')
-
-    @cache
-    def points() -> Landmarks:
-        found = landmarks(
-            pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times, sensor.camera
-        )
-        to_image = sensor.intrinsics.to_image  # pixels of the published images
-        return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
-
-    return PairResult(
-        reference_stamp_ns=first.stamp_ns + later_ns,
-        stamp_ns=second.stamp_ns + later_ns,
-        reference_ns1=first.imu.reference_ns,
-        reference_ns2=second.imu.reference_ns,
-        frame_id=second.frame_id,
-        interval=interval_of(first.imu, second.imu),
-        pose=pose,
-        matches=matches,
-        row_times1=rays1.row_times,
-        row_times2=rays2.row_times,
-        rays1=rays1.rays,
-        rays2=rays2.rays,
-        parallax=parallax_of(rays1, rays2, gyro, sensor),
-        landmarks_of=points if pose else None,
-        gyro_rotation=None if gyro is None else gyro.rotation,
-        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.bias,
-    )
+    return inertial_motion(since, first, second, parameters.imu)
 
 
 def _with_gravity(
@@ -417,81 +447,9 @@ def _with_gravity(
             validate.replaced(imu2.motion, gravity=None),
             configured,
         )
-    # One sigma for both frames: that of the filter where it is larger than the parameter.
-    return imu1.motion, imu2.motion, min(max(configured, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA)
-
-
-# -- Frames between the two of a pair ---------------------------------------------------------
-#
-# Each step of a tracker adds its error, and the windows of a pair's last frame are aligned with
-# those of its first one: the drift of a track is known there. In the frames before, it was a part
-# of that in proportion to time, which is the mean of a random walk with known ends.
-
-# Frames between that are used, evenly in the pair: more of them add hardly any accuracy.
-MOST_FRAMES = 5
-
-
-def used_frames(between: Sequence[Frames]) -> list[Frames]:
-    """Those of the frames between the two of a pair that its estimate uses."""
-    places = np.linspace(-1, len(between), min(len(between), MOST_FRAMES) + 2)[1:-1]
-    return [between[k] for k in np.round(places).astype(int)]
-
-
-class _TrackedFrame(NamedTuple):
-    """A frame after the reference."""
-
-    imu: FrameImu
-    gyro: ImuSlice  # since the reference
-    matches: Matches  # as tracked
-
-
-class TrackHistory:
-    """The frames since a reference keyframe."""
-
-    def __init__(self, reference: FrameImu) -> None:
-        self._reference = reference
-        self._frames: list[_TrackedFrame] = []
-
-    def add(self, imu: FrameImu, gyro: ImuSlice, matches: Matches) -> None:
-        """Add the current frame with its tracks."""
-        self._frames.append(_TrackedFrame(imu, gyro, matches))
-
-    def between(
-        self, matches: Matches, sensor: Sensor, inertial: InertialMotion | str
-    ) -> list[IntermediateFrame]:
-        """Frames between the reference and the last one, with the tracks of a pair's `matches`.
-
-        `inertial`: motion of the pair.
-        """
-        *before, last = self._frames
-        chosen = used_frames(before)
-        motions: list[InertialMotion | None] = [None] * len(chosen)
-        if not isinstance(inertial, str):
-            motions = list(
-                motions_on_the_way(
-                    inertial, self._reference, last.gyro, [frame.imu for frame in chosen]
-                )
-            )
-        drift = matches.points2 - _points(last.matches, matches)
-        interval = self._interval(last.imu)
-        return [
-            validate.unchecked(
-                IntermediateFrame,
-                points=sensor.intrinsics.to_sensor(
-                    _points(frame.matches, matches) + self._interval(frame.imu) / interval * drift
-                ),
-                motion=frame.imu.motion,
-                interval=self._interval(frame.imu),
-                relative_rotation=frame.gyro.rotation,
-                relative_rotation_covariance=frame.gyro.covariance,
-                inertial=motion,
-            )
-            for frame, motion in zip(chosen, motions, strict=True)
-        ]
-
-    def _interval(self, imu: FrameImu) -> float:
-        """Seconds from the stamped row of the reference to that of a frame."""
-        return seconds_between(self._reference.reference_ns, imu.reference_ns)
+    # One sigma for both frames: the filter's where it is larger than the parameter.
+    sigma = min(max(configured, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA)
+    return imu1.motion, imu2.motion, sigma
 
 
 def _points(tracked: Matches, wanted: Matches) -> Array:

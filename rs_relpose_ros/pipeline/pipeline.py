@@ -9,30 +9,27 @@ import time
 from typing import Any, Generic
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
+from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
+from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.matches import Ids, Matches
+from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
-from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, rotation_sensitivity
+from rs_relpose_ros.imu.integration import ImuSlice, rotation_sensitivity
 from rs_relpose_ros.pipeline import findings, pair
 from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
-from rs_relpose_ros.pipeline.pair import (
-    DerotatedRays,
-    Frame,
-    PairResult,
-    Result,
-    TrackHistory,
-)
+from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result, TrackHistory
 from rs_relpose_ros.pipeline.recursion import PairData
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
-from rs_relpose_ros.tracking.features import make_tracker, Matches, Tracker
+from rs_relpose_ros.tracking.features import make_tracker, Tracker
 
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
 # compared with the gyro.
@@ -48,7 +45,7 @@ class _RotationStart:
     """An image that later ones are compared with, and the gyro's rotation since."""
 
     stamp_ns: int
-    ids: NDArray[np.uint32]  # (N,) of tracks
+    ids: Ids  # (N,) of tracks
     rays: Array  # (N, 3) as measured
     by_gyro: Array = field(default_factory=lambda: np.eye(3))
     frames: int = 0
@@ -103,12 +100,11 @@ class Pipeline(Processor[PairResult]):
         self.prepare()  # live it is done by now
         self._tracker.reset()
         self._stamps_ns.clear()
-        self._reference: Frame[Any] | None = None
+        self._history: TrackHistory | None = None  # since the reference
         self._previous: Frame[Any] | None = None
-        self._since: ImuSlice | None = None  # from the reference to the last frame
-        self._frames = 0  # since the reference
-        self._reference_rays: DerotatedRays | None = None
-        self._current_rays: DerotatedRays | None = None
+        # The last derotated matches; of the reference: None until there are any.
+        self._of_reference: Matches | None = None
+        self._of_previous: Matches | None = None
         self._rotation: _RotationStart | None = None
         self._unmatched_ns: int | None = None  # of the last published pair with too few matches
 
@@ -119,58 +115,61 @@ class Pipeline(Processor[PairResult]):
         differ from the last one's, or that follows a gap of the gyro.
         """
         self.prepare()
-        sensor = sensor_model(frame.intrinsics, parameters.sensor, self.applied.readout_time)
-        if self._sensor is None or frame.intrinsics != self._sensor.intrinsics:
-            self.reset()
-            self._monitor = ConsistencyMonitor()
-        if sensor != self._sensor:
-            self._current_rays = None  # their row times are those of the camera before
-        self._sensor, self._readout, imu = sensor, self.applied.readout_time, frame.imu
+        sensor = self._sensor_of(frame.intrinsics, parameters)
         self._stamps_ns.append(frame.stamp_ns)
         self._monitor.ahead.append(frame.ahead)
-        reference, previous = self._reference, self._previous
+        history, previous = self._history, self._previous
+        step = frame.imu.since_previous
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
-        if reference is None or previous is None or imu.since_previous is None:
+        if history is None or previous is None or step is None:
             self._tracker.start(frame.image)
             self._restart_from(frame)
             return None
-        self._frames += 1
-        rotation = imu.since_previous.rotation
-        predicted = self._predicted(previous.imu.motion, imu.motion, rotation, sensor)
-        matches = self._tracker.track(
-            frame.image, predicted, seconds_between(previous.stamp_ns, frame.stamp_ns)
-        )
+        predicted = self._predicted(previous.imu.motion, frame.imu.motion, step.rotation, sensor)
+        passed = seconds_between(previous.stamp_ns, frame.stamp_ns)
+        matches = self._tracker.track(frame.image, predicted, passed)
         self._previous = frame
-        gyro = (
-            imu.since_previous if self._since is None else self._since.joined(imu.since_previous)
-        )
-        self._since = gyro
-        self._history.add(imu, gyro, matches)
-        rays1, rays2 = self._derotate(matches, reference.imu.motion, imu.motion, sensor)
+        since = step if history.since is None else history.since.joined(step)
+        history.add(frame.imu, since, matches)
+        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         keyframe = pair.is_keyframe(
             parameters.keyframes,
-            parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
-            interval=pair.interval_of(reference.imu, imu),
-            frames=self._frames,
+            parallax=pair.parallax_of(rays, since, sensor),
+            interval=pair.interval_of(history.imu, frame.imu),
+            frames=len(history),
             tracked_fraction=self._tracker.tracked_fraction,
         )
-        if not keyframe:
-            self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
-            return None
-        self._compare = partial(
-            self._compare_rotations, frame.stamp_ns, matches, rotation, sensor, keyframe
+        compare = partial(
+            self._compare_rotations, frame.stamp_ns, matches, step.rotation, sensor, keyframe
         )
-        result = self._pair(reference, frame, gyro, sensor, parameters)
+        if not keyframe:
+            compare()
+            return None
+        self._compare = compare
+        result = self._pair(history, frame, sensor, parameters)
         self._restart_from(frame)
-        if result.pose.status is Status.TOO_FEW_MATCHES:
-            # Where nothing can be matched each frame creates a pair.
-            if (
-                self._unmatched_ns is not None
-                and seconds_between(self._unmatched_ns, frame.stamp_ns) < _UNMATCHED_PERIOD
-            ):
-                return None
-            self._unmatched_ns = frame.stamp_ns
-        return result
+        unmatched = result.pose.status is Status.TOO_FEW_MATCHES
+        return None if unmatched and self._is_repeated(frame.stamp_ns) else result
+
+    def _sensor_of(self, intrinsics: Intrinsics, parameters: Parameters) -> Sensor:
+        """The sensor of the next frame; everything restarts with other intrinsics."""
+        sensor = sensor_model(intrinsics, parameters.sensor, self.applied.readout_time)
+        if self._sensor is None or intrinsics != self._sensor.intrinsics:
+            self.reset()
+            self._monitor = ConsistencyMonitor()
+        if sensor != self._sensor:
+            self._of_previous = None  # its row times are those of the camera before
+        self._sensor = sensor
+        self._readout = self.applied.readout_time
+        return sensor
+
+    def _is_repeated(self, stamp_ns: int) -> bool:
+        """Whether a pair with too few matches follows another one: each frame creates one."""
+        before_ns = self._unmatched_ns
+        if before_ns is not None and seconds_between(before_ns, stamp_ns) < _UNMATCHED_PERIOD:
+            return True
+        self._unmatched_ns = stamp_ns
+        return False
 
     def prepare(self) -> None:
         """Assess the configuration and search new corners, after a pair is published."""
@@ -187,10 +186,9 @@ class Pipeline(Processor[PairResult]):
         return self._monitor.health
 
     def _restart_from(self, frame: Frame[Any]) -> None:
-        self._reference = self._previous = frame
-        self._history = TrackHistory(frame.imu)
-        self._since = self._reference_rays = None
-        self._frames = 0
+        self._previous = frame
+        self._history = TrackHistory(frame.stamp_ns, frame.imu)
+        self._of_reference = None
 
     # -- rays and rotations --------------------------------------------------------------------
 
@@ -205,9 +203,9 @@ class Pipeline(Processor[PairResult]):
         points = self._tracker.points
         if not len(points):
             return None
-        known = self._current_rays
-        if known is not None and np.array_equal(known.points, points):
-            rays, row_times = known.rays, known.row_times
+        known = self._of_previous
+        if known is not None and np.array_equal(known.points2, points):
+            rays, row_times = known.rays[-1], known.row_times[-1]
         else:
             rays, row_times = sensor.derotated(points, previous)
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
@@ -215,16 +213,11 @@ class Pipeline(Processor[PairResult]):
 
     def _derotate(
         self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion, sensor: Sensor
-    ) -> tuple[DerotatedRays, DerotatedRays]:
-        """Rays of matches in the reference and in the current image, which are kept."""
-        # In the reference image points do not move: their rays are kept while they are tracked.
-        known = self._reference_rays
-        first = None if known is None else known.of(matches.track_ids)
-        if first is None:
-            first = DerotatedRays.from_points(matches.track_ids, matches.points1, sensor, motion1)
-        second = DerotatedRays.from_points(matches.track_ids, matches.points2, sensor, motion2)
-        self._reference_rays, self._current_rays = first, second
-        return first, second
+    ) -> Matches:
+        """The matches of reference and current image with their rays, which are kept."""
+        rays = pair.derotated(matches, motion1, motion2, sensor, self._of_reference)
+        self._of_reference = self._of_previous = rays
+        return rays
 
     def _compare_rotations(
         self, stamp_ns: int, matches: Matches, by_gyro: Array, sensor: Sensor, keyframe: bool
@@ -258,72 +251,37 @@ class Pipeline(Processor[PairResult]):
     # -- one pair ----------------------------------------------------------------------------
 
     def _pair(
-        self,
-        reference: Frame[Any],
-        frame: Frame[Any],
-        gyro: ImuSlice,
-        sensor: Sensor,
-        parameters: Parameters,
+        self, history: TrackHistory, frame: Frame[Any], sensor: Sensor, parameters: Parameters
     ) -> PairResult:
         """The pair, suppressed by the state before it; updates the tracked corrections."""
-        matches, monitor = self._tracker.refined_matches(), self._monitor
-        pose = self._estimated(
-            reference.imu,
-            frame.imu,
-            (reference.stamp_ns, frame.stamp_ns),
+        monitor, since = self._monitor, history.since
+        assert since is not None
+        matches = self._tracker.refined_matches()
+        problem = history.problem(
+            frame.stamp_ns,
             matches,
-            gyro,
             sensor,
             parameters,
+            stamp_sigma=stamp_sigma(self._stamps_ns),
         )
-        measurement, to_sensor = None, sensor.intrinsics.to_sensor
-        fitted = pose.rejected or pose  # a contradiction shows what is wrong
-        if np.isfinite(fitted.R).all():
-            measurement = PairData(
-                to_sensor(matches.points1),
-                to_sensor(matches.points2),
-                sensor.camera,
-                reference.imu.motion,
-                frame.imu.motion,
-                pair.interval_of(reference.imu, frame.imu),
-                fitted.R,
-                fitted.t,
-                gyro.rotation,
-                gyro.covariance,
-                rotation_sensitivity(gyro.stamps_ns, gyro.angular_velocities, gyro.noise_density),
-                gyro,
-                parameters.sensor.R_cam_imu,
-                parameters.estimator.gyro_sigma,
-            )
-        bias, active = np.array(parameters.imu.gyro_bias), np.zeros(findings.DEVIATIONS)
-        configured = Configured(
-            parameters.sensor,
-            sensor.camera,
-            bias,
-            configured_sigmas(
-                parameters,
-                seconds_between(*list(self._stamps_ns)[-2:])
-                - parameters.sensor.time_offset_reference_interval,
-            ),
-            active,
-            parameters.intrinsics.principal_point_sigma,
-        )
-        active[findings.OFFSET] = frame.applied_offset_ns / NANOSECONDS
-        active[findings.READOUT] = configured.direction * self._readout
-        active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ gyro.bias - bias
+        pose = self._estimated(problem, frame.stamp_ns)
+        # A contradiction shows what is wrong.
+        fitted = pose.diagnostics.rejected or pose
+        measurement = None
+        if fitted.rotation_known:
+            measurement = _measurement(problem, fitted, since, parameters)
+        configured = self._configured(frame.applied_offset_ns, since, sensor, parameters)
         assessed = monitor.add_pair(frame.stamp_ns, measurement, fitted, configured)
         if fitted is pose:
-            pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
+            pose = monitor.agreement.enlarged(history.stamp_ns, frame.stamp_ns, pose, assessed)
         tracked = Tracked.of(monitor.calibration, configured)
         self.applied = self.applied.moved(tracked, parameters.sensor)
         if parameters.pair.withhold_when_wrong:
             pose = suppressed(pose, monitor.health)
-        rays1, rays2 = self._derotate(matches, reference.imu.motion, frame.imu.motion, sensor)
+        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         latest = monitor.latest
         return replace(
-            pair.pair_result(
-                reference, frame, matches, rays1, rays2, pose, gyro, sensor, parameters
-            ),
+            history.result(frame, rays, pose, sensor, parameters),
             images_against_gyro=None if latest is None else latest.images_against_gyro,
             health=monitor.health,
             tracked=tracked,
@@ -331,51 +289,71 @@ class Pipeline(Processor[PairResult]):
             image2=frame.image if self._keep_images else None,
         )
 
-    def _estimated(
-        self,
-        first: FrameImu,
-        second: FrameImu,
-        stamps_ns: tuple[int, int],
-        matches: Matches,
-        gyro: ImuSlice,
-        sensor: Sensor,
-        parameters: Parameters,
-    ) -> RelativePose:
-        """The pose, without the accelerometer if the images contradict it."""
-        history, sigma = self._history, stamp_sigma(self._stamps_ns)
-
-        def estimate(inertial: InertialMotion | str) -> RelativePose:
-            return pair.estimate_pair(
-                first,
-                second,
-                stamps_ns,
-                matches,
-                sensor,
-                gyro,
-                inertial,
-                parameters,
-                interval=pair.interval_of(first, second),
-                stamp_sigma=sigma,
-                between=history.between(matches, sensor, inertial),
-            )
-
-        inertial = pair.inertial_of(first, second, gyro, parameters)
-        acceleration = self._monitor.acceleration
-        acceleration.report(stamps_ns[1], inertial)
-        if isinstance(inertial, str):
-            return estimate(inertial)
-        used = acceleration.uses(None)
-        pose = estimate(inertial if used else _CONTRADICTED)
-        evidence = (
-            pose.inertial_evidence
-            if used
-            else pair.evidence_without(pose, first, second, sensor, gyro, inertial, parameters)
+    def _configured(
+        self, applied_offset_ns: int, since: ImuSlice, sensor: Sensor, parameters: Parameters
+    ) -> Configured:
+        """The parameters of a pair, and the deviations that are applied to it."""
+        bias = np.array(parameters.imu.gyro_bias)
+        before_ns, stamp_ns = list(self._stamps_ns)[-2:]
+        from_reference = (
+            seconds_between(before_ns, stamp_ns) - parameters.sensor.time_offset_reference_interval
         )
+        configured = Configured(
+            parameters.sensor,
+            sensor.camera,
+            bias,
+            configured_sigmas(parameters, from_reference),
+            np.zeros(findings.DEVIATIONS),
+            parameters.intrinsics.principal_point_sigma,
+        )
+        configured.active[findings.OFFSET] = applied_offset_ns / NANOSECONDS
+        configured.active[findings.READOUT] = configured.direction * self._readout
+        configured.active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ since.bias - bias
+        return configured
+
+    def _estimated(self, problem: PairProblem, stamp_ns: int) -> RelativePose:
+        """The pose, without the accelerometer if the images contradict it."""
+        inertial, acceleration = problem.inertial[-1], self._monitor.acceleration
+        acceleration.report(stamp_ns, inertial or problem.no_inertial)
+        if inertial is None:
+            return estimate(problem)
+        used = acceleration.uses(None)
+        if used:
+            pose = estimate(problem)
+            evidence = pose.diagnostics.inertial_evidence
+        else:
+            pose = estimate(problem.without_inertial(_CONTRADICTED))
+            evidence = evidence_for_inertial(pose, problem)
         if evidence is not None:
-            self._monitor.add_acceleration(stamps_ns[1], evidence)
+            self._monitor.add_acceleration(stamp_ns, evidence)
             if used and not acceleration.uses(evidence):
-                pose = estimate(_CONTRADICTED)
+                pose = estimate(problem.without_inertial(_CONTRADICTED))
         return pose
+
+
+def _measurement(
+    problem: PairProblem, fitted: RelativePose, since: ImuSlice, parameters: Parameters
+) -> PairData:
+    """A pair as the consistency monitor gets it."""
+    sensitivity = rotation_sensitivity(
+        since.stamps_ns, since.angular_velocities, since.noise_density
+    )
+    return PairData(
+        problem.matches.points1,
+        problem.matches.points2,
+        problem.camera,
+        problem.motions[0],
+        problem.motions[-1],
+        float(problem.seconds[-1]),
+        fitted.R,
+        fitted.t,
+        since.rotation,
+        since.covariance,
+        sensitivity,
+        since,
+        parameters.sensor.R_cam_imu,
+        parameters.estimator.gyro_sigma,
+    )
 
 
 # -- The loop over frames -------------------------------------------------------------------------

@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
 from rs_relpose_ros.estimator import frames_between
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose, Estimation
-from rs_relpose_ros.estimator.frames_between import IntermediateFrame
-from rs_relpose_ros.estimator.problem import build_problem
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.arguments import estimate_relative_pose, IntermediateFrame
+from rs_relpose_ros.estimator.estimate import Estimation
+from rs_relpose_ros.estimator.pair_problem import PairProblem
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import MODES
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -130,16 +131,21 @@ def _halfway() -> IntermediateFrame:
     return IntermediateFrame(0.5 * (points1 + points2), motion, 0.1, *_ROTATION)
 
 
-def _estimation() -> Estimation:
+def _problem() -> PairProblem:
+    """A pair with a frame between, halfway."""
     points1, points2, camera, motion = _sideways()
-    problem = build_problem(points1, points2, camera, motion, motion, *_ROTATION)
-    return Estimation(
-        problem,
-        MODES['auto'],
+    points = np.stack([points1, 0.5 * (points1 + points2), points2])
+    rotation, covariance = _ROTATION
+    return PairProblem(
+        Matches(np.arange(len(points1), dtype=np.uint32), points, np.ones(len(points1))),
+        camera,
+        (motion,) * 3,
+        np.array([0.0, 0.1, 0.2]),
+        np.stack([rotation] * 3),
+        np.stack([covariance] * 3),
+        (None,) * 3,
         EstimatorConfig(),
-        np.arange(len(points1)),
-        np.zeros(1, dtype=np.uint64),
-        None,
+        0,
     )
 
 
@@ -165,24 +171,16 @@ def fill_cache() -> None:
         assert solver.address
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
-    points1, points2, camera, motion = _sideways()
+    problem = _problem()
     pose = RelativePose(
         status=Status.OK,
-        inliers=np.ones(len(points1), dtype=bool),
+        inliers=np.ones(len(problem.matches), dtype=bool),
         R=np.eye(3),
         t=np.eye(3)[0],
-        residual_rms=1.0,
+        diagnostics=Diagnostics(residual_rms=1.0),
     )
-    frames_between.refined(
-        pose,
-        points1,
-        motion,
-        (points2, motion, 0.2, *_ROTATION, None),
-        [_halfway()],
-        camera,
-        EstimatorConfig(),
-    )
-    _estimation().sample()  # with what the other process has compiled by then
+    frames_between.refined(pose, problem)
+    Estimation(problem).sample()  # with what the other process has compiled by then
     other_half.join()
     warm_up_pipeline(Parameters())
     _mark().touch()
@@ -191,7 +189,7 @@ def fill_cache() -> None:
 def _fill_half(parent: int) -> None:
     """Compile a two-view estimate without sampling."""
     _end_with(parent)
-    _estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
+    Estimation(_problem()).refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
 
 
 def _end_with(parent: int) -> None:

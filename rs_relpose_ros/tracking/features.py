@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from rs_relpose_ros.config.settings import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import checked, Image
 
@@ -111,30 +112,6 @@ def _spread(points: Array, taken: Array, cell: float) -> NDArray[np.intp]:
     return np.argsort(rank[len(taken) :], kind='stable')
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Matches:
-    """Corresponding points of the reference keyframe and the current frame; read-only."""
-
-    track_ids: NDArray[np.uint32]  # (N,) the same for the same track in all pairs
-    points1: Array  # (N, 2) raw pixels in the reference keyframe
-    points2: Array  # (N, 2) raw pixels in the current frame
-    quality: Array  # (N,) in [0, 1], higher is better
-
-    @classmethod
-    def none(cls) -> Matches:
-        """No matches."""
-        return cls(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-
-    def __len__(self) -> int:
-        return len(self.track_ids)
-
-    def kept(self, mask: NDArray[np.bool_]) -> Matches:
-        """Those of a mask (N,)."""
-        return Matches(
-            self.track_ids[mask], self.points1[mask], self.points2[mask], self.quality[mask]
-        )
-
-
 class TrackIds:
     """Ids of tracks, counted over all resets of a tracker."""
 
@@ -222,8 +199,7 @@ class DescriptorTracker:
         self._current = found
         self._matches = Matches(
             self._reference.ids[indices1],
-            self._reference.points[indices1],
-            found.points[indices2],
+            np.stack([self._reference.points[indices1], found.points[indices2]]),
             quality,
         )
         self._most = max(self._most, len(self._matches))

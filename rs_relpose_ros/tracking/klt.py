@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.tracking import features, windows
-from rs_relpose_ros.tracking.features import Matches
 from rs_relpose_ros.tracking.images import checked, Image
 
 # OpenCV's termination criteria: kind, steps, step [px].
@@ -178,7 +178,7 @@ def aligned(
     )
     # At equal correlation a faint corner ranks behind a strong one.
     quality = correlation * flow.strength / (flow.strength + config.feature_quality)
-    return replace(matches, points2=found, quality=quality), good
+    return replace(matches.followed(found), quality=quality), good
 
 
 def window_homography(points1: Array, points2: Array) -> Array:
@@ -288,7 +288,7 @@ class KltTracker:
         self._guesses_near = bool(far <= _MOST_FAR * len(off))
         first, last = features.feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
-        self._set(replace(self._matches, points2=found), (found - predicted) / interval, good)
+        self._set(self._matches.followed(found), (found - predicted) / interval, good)
         self._current = current
         self._refined = False
         return self._matches
@@ -320,8 +320,7 @@ class KltTracker:
         points = np.concatenate([kept, new])
         self._matches = Matches(
             np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))]),
-            points,
-            points,
+            np.stack([points, points]),
             np.ones(len(points)),
         )
         self._unexplained = np.concatenate([self._unexplained[apart], np.zeros_like(new)])
