@@ -37,45 +37,58 @@ from rs_relpose_ros.offline.replay import read_truth, Replay
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='module', params=['', '1'], ids=['own executor', 'executor of rclpy'])
 def run(
-    module_ros_domain_id: int, bundled_bag: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    module_ros_domain_id: int,
+    bundled_bag: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> SimpleNamespace:
     """What the node published while the bag was played, and what it wrote."""
     stamps_file = tmp_path_factory.mktemp('live') / 'stamps.txt'
     with (
+        pytest.MonkeyPatch.context() as environment,
         Graph() as graph,
-        node_process(
+    ):
+        environment.setenv('RS_RELPOSE_PUBLIC_RCLPY', request.param)
+        with node_process(
             BUNDLED_PARAMETERS,
             remap=BAG_TOPICS,
             parameters={
                 'stamps_file': stamps_file,
                 **faults.reliable(COMPRESSED_TOPIC, IMU_TOPIC),
             },
-        ) as node,
-    ):
-        messages = {
-            topic: graph.listen(message_class(kind), f'/relpose_node/{topic}')
-            for topic, kind in PAIR_TOPICS.items()
-        }
-        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        node.wait_for('ready')
-        for topic in PAIR_TOPICS:
-            graph.wait_for_publisher(f'/relpose_node/{topic}')
-        with player_process(bundled_bag) as playing:
-            assert playing.wait() == 0
-        count = len(diagnostics)
-        # The report after the last frame.
-        wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics', node)
-        code, seconds = node.signal(signal.SIGTERM)
+        ) as node:
+            messages, diagnostics = listen_to_a_run(graph, node, bundled_bag)
+            code, seconds = node.signal(signal.SIGTERM)
+            output = node.output
         return SimpleNamespace(
             messages=messages,
             diagnostics=diagnostics,
-            output=node.output,
+            output=output,
             exit_code=code,
             seconds_to_end=seconds,
             stamps=[int(line) for line in stamps_file.read_text().split()],
+            fallbacks=int(bool(request.param)),
         )
+
+
+def listen_to_a_run(graph: Graph, node: Process, bag: Path) -> tuple[dict[str, Any], list[Any]]:
+    """Play a bag to a node. Returns its messages by topic, and its reports."""
+    messages = {
+        topic: graph.listen(message_class(kind), f'/relpose_node/{topic}')
+        for topic, kind in PAIR_TOPICS.items()
+    }
+    diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+    node.wait_for('ready')
+    for topic in PAIR_TOPICS:
+        graph.wait_for_publisher(f'/relpose_node/{topic}')
+    with player_process(bag) as playing:
+        assert playing.wait() == 0
+    count = len(diagnostics)
+    # The report after the last frame.
+    wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics', node)
+    return messages, diagnostics
 
 
 def test_poses_are_those_of_the_truth(run, bundled_bag):
@@ -162,8 +175,9 @@ def test_a_good_run_ends_well_and_says_little(run):
     assert 'Traceback' not in run.output
     # At most that the machine was busy, and that the player came late.
     assert run.output.count('(overload)') <= 1
+    assert run.output.count('executor of rclpy') == run.fallbacks
     assert run.output.count('[WARN]') == (
-        run.output.count('(overload)') + run.output.count('no image on')
+        run.output.count('(overload)') + run.output.count('no image on') + run.fallbacks
     )
 
 

@@ -7,6 +7,7 @@ import itertools
 from pathlib import Path
 import re
 import threading
+import time
 from typing import Any
 
 from conftest import Clock, ROOT
@@ -16,14 +17,17 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.task import Task
+from std_msgs.msg import String
 
+from rs_relpose_lab.live.processes import wait_until
 from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.geometry.matches import Matches
-from rs_relpose_ros.nodes import diagnostics
+from rs_relpose_ros.nodes import diagnostics, executor
 from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Silence, Statistics, WARN
-from rs_relpose_ros.nodes.inputs import KeptWaitSet
+from rs_relpose_ros.nodes.executor import KeptWaitSet
 from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -492,27 +496,69 @@ def node(module_ros_domain_id: int) -> Iterator[Node]:
 
 def test_a_task_that_nothing_announces_is_run(node):
     """Its guard was read while rclpy looked for other work: a node would not end."""
-    executor, done = KeptWaitSet(context=node.context), threading.Event()
-    executor.add_node(node)
+    kept, done = KeptWaitSet(context=node.context), threading.Event()
+    kept.add_node(node)
 
     def add() -> None:
         timer.cancel()
-        executor._tasks.append((Task(done.set, executor=executor), None, None))
+        kept._tasks.append((Task(done.set, executor=kept), None, None))
 
     def spin() -> None:
         while not done.is_set():
-            executor.spin_once()
+            kept.spin_once()
 
     timer, thread = node.create_timer(0.01, add), threading.Thread(target=spin)
     thread.start()
     try:
         assert done.wait(20.0)
     finally:
-        executor.create_task(done.set)
+        kept.create_task(done.set)
         thread.join()
-        executor.release()
-        executor.remove_node(node)
+        kept.release()
+        kept.remove_node(node)
         node.destroy_timer(timer)
+
+
+def executor_without(monkeypatch: pytest.MonkeyPatch, problem: str) -> None:
+    """Make rclpy one in which the executor of the nodes cannot work."""
+    if problem == 'take_message':
+        monkeypatch.setattr(executor.rclpy_implementation, 'Subscription', object)
+    elif problem == 'WaitSet':
+        monkeypatch.delattr(executor.rclpy_implementation, 'WaitSet')
+    else:  # an executor that calls nothing, as the EventsExecutor of some wheels
+        monkeypatch.setattr(executor, '_TEST_TIME', 0.2)
+        monkeypatch.setattr(KeptWaitSet, 'spin_once', lambda self, timeout: time.sleep(0.05))
+
+
+@pytest.mark.parametrize('problem', ['', 'take_message', 'WaitSet', 'calls no task'])
+def test_polled_messages_come_with_either_executor(node, monkeypatch, problem):
+    if problem:
+        executor_without(monkeypatch, problem)
+    used, reported = executor.make_executor(node)
+    monkeypatch.undo()
+    assert isinstance(used, KeptWaitSet) is (not problem)
+    assert problem in reported and bool(reported) is bool(problem)
+    received: list[str] = []
+    subscription = executor.PolledSubscription(
+        node, String, 'polled', QoSProfile(depth=50), received.extend, lambda: False
+    )
+    timer = node.create_timer(0.02, subscription.drain)
+    publisher = node.create_publisher(String, 'polled', QoSProfile(depth=50))
+    try:
+        wait_until(lambda: publisher.get_subscription_count() == 1, 'the subscription')
+        for text in 'abc':
+            publisher.publish(String(data=text))
+        end = time.monotonic() + 10.0
+        while len(received) < 3 and time.monotonic() < end:
+            used.spin_once()
+    finally:
+        if isinstance(used, KeptWaitSet):
+            used.release()
+        used.remove_node(node)
+        node.destroy_timer(timer)
+        node.destroy_publisher(publisher)
+        node.destroy_subscription(subscription._subscription)
+    assert [message.data for message in received] == ['a', 'b', 'c']
 
 
 CHANGES: list[Parameters] = []

@@ -5,12 +5,11 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 `InputError`.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from functools import partial
 import math
 import re
-import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,96 +115,36 @@ def info_field(msg: Any, name: str) -> Any:
 def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
     """Gyro and accelerometer of a sensor_msgs/Imu, each None if the message has no such sensor.
 
-    `msg`: deserialised, or its bytes of CDR. By REP-145 a covariance whose first element is -1
-    means that the sensor does not exist. Drivers with one topic per sensor leave the other vector
-    zero, so an accelerometer that reads exactly zero in all axes counts as absent. Not
-    `with_gyro`: the topic is that of the accelerometer.
+    By REP-145 a covariance whose first element is -1 means that the sensor does not exist. Drivers
+    with one topic per sensor leave the other vector zero, so an accelerometer that reads exactly
+    zero in all axes counts as absent. Without `with_gyro` the topic is that of the accelerometer.
     """
-    if isinstance(msg, bytes):
-        stamp, numbers = _imu_of_cdr(msg)
-    else:
-        q, w, f = msg.orientation, msg.angular_velocity, msg.linear_acceleration
-        stamp, numbers = (
-            stamp_ns(msg.header),
-            (
-                q.x,
-                q.y,
-                q.z,
-                q.w,
-                *msg.orientation_covariance,
-                w.x,
-                w.y,
-                w.z,
-                *msg.angular_velocity_covariance,
-                f.x,
-                f.y,
-                f.z,
-                *msg.linear_acceleration_covariance,
-            ),
-        )
-    # Each vector is followed by its covariance (3, 3).
+    stamp, rate, force = stamp_ns(msg.header), msg.angular_velocity, msg.linear_acceleration
     angular_velocity = linear_acceleration = None
-    if with_gyro and numbers[16] != -1.0:
-        angular_velocity = _vector('angular_velocity', numbers[13:16], MAX_ANGULAR_VELOCITY)
-    if numbers[28] != -1.0 and any(numbers[25:28]):
-        linear_acceleration = _vector(
-            'linear_acceleration', numbers[25:28], MAX_LINEAR_ACCELERATION
-        )
+    if with_gyro and msg.angular_velocity_covariance[0] != -1.0:
+        angular_velocity = _vector('angular_velocity', rate, MAX_ANGULAR_VELOCITY)
+    if msg.linear_acceleration_covariance[0] != -1.0 and (force.x or force.y or force.z):
+        linear_acceleration = _vector('linear_acceleration', force, MAX_LINEAR_ACCELERATION)
     if angular_velocity is None and linear_acceleration is None:
         raise InputError(
             'an IMU message has neither gyro nor accelerometer: both are marked as '
             'absent (covariance -1) or zero'
         )
-    return ImuSample(
-        stamp,
-        angular_velocity,
-        linear_acceleration,
-        None if angular_velocity is None else _orientation(numbers[:4], numbers[4], numbers[8]),
+    down = None if angular_velocity is None else _orientation(msg)
+    return ImuSample(stamp, angular_velocity, linear_acceleration, down)
+
+
+def _orientation(msg: Any) -> tuple[float, float, float, float] | None:
+    """Down and its sigma [rad]; None without usable variances (0: unknown by REP-145)."""
+    q, about_x, about_y = (
+        msg.orientation,
+        float(msg.orientation_covariance[0]),
+        float(msg.orientation_covariance[4]),
     )
-
-
-# CDR of a header: kind and options of the encoding, stamp, size of frame_id with its end.
-_HEADER = struct.Struct('<2s2xiII')
-_LITTLE_ENDIAN = bytes((0, 1))
-# Orientation, angular velocity, linear acceleration, each followed by its covariance (3, 3).
-_IMU_NUMBERS = struct.Struct('<37d')
-
-
-def frame_id_of_cdr(data: bytes) -> str:
-    """frame_id of the CDR of a message with a header; empty if it is too short."""
-    end = _HEADER.size + int.from_bytes(data[_HEADER.size - 4 : _HEADER.size], 'little') - 1
-    return data[_HEADER.size : end].decode(errors='replace')
-
-
-def stamp_of_cdr(data: bytes) -> int:
-    """Stamp [ns] of the CDR of a message with a header."""
-    try:
-        encoding, seconds, nanoseconds, _ = _HEADER.unpack_from(data)
-    except struct.error as error:
-        raise InputError(f'the CDR of a message is too short: {error}') from None
-    if encoding != _LITTLE_ENDIAN:
-        raise InputError('the CDR of a message is not little-endian')
-    return _nanoseconds(seconds, nanoseconds)
-
-
-def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
-    """Stamp [ns] and numbers of a sensor_msgs/Imu, sooner than by its deserialisation."""
-    stamp = stamp_of_cdr(data)
-    # Aligned to 8 bytes from the end of kind and options (4).
-    start = 4 - -(_HEADER.size - 4 + _HEADER.unpack_from(data)[3]) // 8 * 8
-    try:
-        return stamp, _IMU_NUMBERS.unpack_from(data, start)
-    except struct.error as error:
-        raise InputError(f'the CDR of an IMU message is too short: {error}') from None
-
-
-def _orientation(
-    quat_xyzw: Sequence[float], first: float, second: float
-) -> tuple[float, float, float, float] | None:
-    """Down and its sigma; None without usable variances (0: unknown by REP-145)."""
-    x, y, z, w = map(float, quat_xyzw)
-    variance, norm2 = max(float(first), float(second)), x * x + y * y + z * z + w * w
-    if not (first > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
+    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    variance = max(about_x, about_y)
+    norm2 = x * x + y * y + z * z + w * w
+    if not (about_x > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
         return None
     # Minus the third row of R(q), world from IMU.
     return (
@@ -216,8 +155,9 @@ def _orientation(
     )
 
 
-def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, float, float]:
-    values = float(vector[0]), float(vector[1]), float(vector[2])
+def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:
+    """Elements of a geometry_msgs/Vector3; InputError where one is not finite or too large."""
+    values = float(vector.x), float(vector.y), float(vector.z)
     if not all(map(math.isfinite, values)):
         raise InputError(f'{name} of an IMU message must be finite, got {list(values)}')
     if max(map(abs, values)) > largest:

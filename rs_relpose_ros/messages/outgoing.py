@@ -567,7 +567,7 @@ def _byte_data(values: NDArray[Any], message_type: Any) -> Any:
     """Bytes in the container of the message; rclpy copies an ndarray element by element."""
     if _is_rclpy(message_type):
         data = array('B')
-        data.frombytes(values.tobytes())
+        data.frombytes(np.ascontiguousarray(values).ravel().view(np.uint8).data)
         return data
     return np.frombuffer(values.tobytes(), dtype=np.uint8)
 

@@ -20,7 +20,7 @@ from rs_relpose_ros.nodes.diagnostics import (
     RELATIVE_POSE,
     WARN,
 )
-from rs_relpose_ros.nodes.inputs import message_class, Serialised
+from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline import global_shutter
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, NOT_EVALUATED
@@ -137,7 +137,6 @@ class GlobalShutterNode(SensorNode):
                 ('CameraInfo', 'camera_info'),
             )
         )
-        self._images, self._camera_infos = Serialised(), Serialised()
         self._log_health = HealthLog(self._info, self._warn, self._error, 'images')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
@@ -188,12 +187,7 @@ class GlobalShutterNode(SensorNode):
             pixels = frame.image()
             if raw:
                 self._image.publish(
-                    self._images(
-                        stamp_ns,
-                        (frame_id, pixels.values.shape, pixels.encoding),
-                        partial(outgoing.image_message, 0, frame_id, pixels, message_class),
-                        pixels.values.tobytes(),
-                    )
+                    outgoing.image_message(stamp_ns, frame_id, pixels, message_class)
                 )
             if compressed:
                 self._compressed.publish(
@@ -203,13 +197,7 @@ class GlobalShutterNode(SensorNode):
                 )
         published = self._intake.camera_info_of(intrinsics)
         self._camera_info.publish(
-            self._camera_infos(
-                stamp_ns,
-                (frame_id, intrinsics, published),
-                partial(
-                    outgoing.camera_info_message, 0, frame_id, intrinsics, published, message_class
-                ),
-            )
+            outgoing.camera_info_message(stamp_ns, frame_id, intrinsics, published, message_class)
         )
         if mask:
             self._mask.publish(

@@ -6,7 +6,6 @@ from functools import partial
 import time
 from typing import Any
 
-import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -15,9 +14,10 @@ from std_srvs.srv import Trigger
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import frame_id_of_cdr, PARTS, Role, stamp_of_cdr
+from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import inputs
+from rs_relpose_ros.nodes.executor import PolledSubscription
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.parameters import legal_qos
 from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
@@ -89,7 +89,6 @@ class OdometryNode(StoppableNode):
         self._begun, self._config = True, parameters.odometry
         self._use(parameters)
         self._sample_at = time.monotonic()
-        self._serialised = inputs.Serialised()
         self._frames: dict[Role, str] = {}  # of the samples
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
         self._transforms = (
@@ -126,21 +125,18 @@ class OdometryNode(StoppableNode):
             msgtype: str,
             qos: QoSProfile,
             receive: Callable[[Any], None],
-            *,
-            raw: bool = True,
-        ) -> inputs.PolledSubscription:
+        ) -> PolledSubscription:
             def receive_all(messages: list[Any]) -> None:
                 for message in messages:
                     receive(message)
 
-            return inputs.PolledSubscription(
+            return PolledSubscription(
                 self,
                 message_class(msgtype),
                 topic,
                 qos,
                 receive_all,
                 lambda: False,
-                raw=raw,
                 qos_overriding_options=overridable(),
             )
 
@@ -160,14 +156,13 @@ class OdometryNode(StoppableNode):
                 Role.CAMERA_INFO.value,
                 'sensor_msgs/msg/CameraInfo',
                 inputs.best_effort(_DEPTH),
-                lambda info: self._estimator.add_frame(stamp_of_cdr(info)),
+                lambda info: self._estimator.add_frame(stamp_ns(info.header)),
             ),
             polled(
                 _PAIRS,
                 'diagnostic_msgs/msg/DiagnosticArray',
                 QoSProfile(depth=outgoing.PAIR_HISTORY),
                 self._on_pair,
-                raw=False,
             ),
         ]
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
@@ -216,8 +211,8 @@ class OdometryNode(StoppableNode):
         if values:
             self._settings.adopt(values)
 
-    def _on_sample(self, role: Role, data: bytes) -> None:
-        frame = frame_id_of_cdr(data)
+    def _on_sample(self, role: Role, message: Any) -> None:
+        frame = message.header.frame_id
         first = self._frames.setdefault(role, frame)
         if frame != first:
             self._warn(
@@ -229,7 +224,7 @@ class OdometryNode(StoppableNode):
         if role is Role.IMU:
             self._silent[self._imu] = 0
         try:
-            self._estimator.add_imu(PARTS[role].read(data))
+            self._estimator.add_imu(PARTS[role].read(message))
         except InputError as error:
             self._warn(str(error))
             return
@@ -262,33 +257,28 @@ class OdometryNode(StoppableNode):
             # A change of the state has the level of the state.
             (self._info, self._warn, self._error)[_LEVELS.get(text.partition(':')[0], 0)](text)
 
-    def _message(self, odometry: Odometry) -> bytes:
-        """A serialised nav_msgs/Odometry, whose numbers are its end."""
-
-        def empty() -> Any:
-            return message_class('nav_msgs/msg/Odometry')(
-                header=outgoing.header(0, self._config.odometry_frame, message_class),
-                child_frame_id=odometry.frame_id,
-            )
-
-        of_pose, of_twist = map(
-            outgoing.published_covariance, (odometry.pose_covariance, odometry.velocity_covariance)
-        )
-        # The twist is in the axes of the child frame.
-        return self._serialised(
+    def _message(self, odometry: Odometry) -> Any:
+        """nav_msgs/Odometry; its twist is in the axes of the child frame."""
+        pose = outgoing.pose_stamped_message(
             odometry.stamp_ns,
-            odometry.frame_id,
-            empty,
-            np.concatenate(
-                [
-                    odometry.position,
-                    outgoing.quat_xyzw(odometry.R),
-                    of_pose,
-                    odometry.velocity,
-                    odometry.angular_velocity,
-                    of_twist,
-                ]
-            ).tobytes(),
+            self._config.odometry_frame,
+            odometry.R,
+            odometry.position,
+            message_class,
+        )
+        return message_class('nav_msgs/msg/Odometry')(
+            header=pose.header,
+            child_frame_id=odometry.frame_id,
+            pose=message_class('geometry_msgs/msg/PoseWithCovariance')(
+                pose=pose.pose,
+                covariance=outgoing.published_covariance(odometry.pose_covariance),
+            ),
+            twist=outgoing.twist_message(
+                odometry.velocity,
+                odometry.angular_velocity,
+                odometry.velocity_covariance,
+                message_class,
+            ),
         )
 
     def _publish(self, imu_ns: int) -> None:

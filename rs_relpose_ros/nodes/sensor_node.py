@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -38,8 +38,8 @@ from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import LineFile, PATIENCE, ReasonLog, SILENCE, STARTING
+from rs_relpose_ros.nodes.executor import KeptWaitSet, make_executor
 from rs_relpose_ros.nodes.inputs import (
-    KeptWaitSet,
     LATCHED,
     message_class,
     SensorInputs,
@@ -156,12 +156,22 @@ def run_node(
     if not (os.environ.get('HOME') or os.environ.get('ROS_HOME')):  # rcl has no folder to log in
         os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
     rclpy.init(args=list(given), signal_handler_options=SignalHandlerOptions.NO)
-    executor, stopped = KeptWaitSet(), threading.Event()
-    on_started(lambda: executor.create_task(stopped.set))
+    executor: SingleThreadedExecutor | None = None
     node: StoppableNode | None = None
+    stopped = threading.Event()
+
+    def stop() -> None:
+        stopped.set()
+        if executor is not None:
+            executor.create_task(stopped.set)  # wakes it
+
+    on_started(stop)
     try:
         node = make()
-        executor.add_node(node)
+        executor, problem = make_executor(node)
+        if problem:
+            text = f'the executor of rclpy runs this node, with more load: {problem}'
+            logger.warning(text)
         while not stopped.is_set():
             executor.spin_once()
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -174,7 +184,8 @@ def run_node(
             if not node.stop():
                 # The thread compiles or loads kernels, which cannot be interrupted.
                 leave(0)
-            executor.release()
+            if isinstance(executor, KeptWaitSet):
+                executor.release()
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
