@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.core import epipolar, losses, triangulate
+from rs_relpose_ros.core import epipolar, least_squares, losses, triangulate
 
 
 def random_views(rng, n=40):
@@ -115,3 +115,73 @@ def test_robust_scale_is_the_sigma_of_normal_deviates_despite_outliers():
     assert losses.robust_scale(residuals[-8:], 0.0, 6.0) == pytest.approx(
         2.0 * losses.robust_scale(residuals[-8:], 0.0, 0.0)
     )
+
+
+def random_information(rng, n):
+    J = rng.normal(size=(n + 3, n))
+    return J.T @ J
+
+
+def test_eliminated_unknowns_are_at_the_optimum_for_the_kept_ones():
+    rng = np.random.default_rng(5)
+    H, g = random_information(rng, 7), rng.normal(size=7)
+    kept = rng.normal(size=3)
+    own = np.linalg.solve(H[3:, 3:], -g[3:] - H[3:, :3] @ kept)
+    x = np.concatenate([kept, own])
+    H_kept, g_kept = least_squares.eliminate(H, g, 3)
+    still = np.concatenate([np.zeros(3), np.linalg.solve(H[3:, 3:], -g[3:])])
+    gain = (x @ H @ x + 2 * g @ x) - (still @ H @ still + 2 * g @ still)
+    assert kept @ H_kept @ kept + 2 * g_kept @ kept == pytest.approx(gain, rel=1e-9)
+    H[5:], H[:, 5:], g[5:] = 0.0, 0.0, 0.0  # nothing is known about two of the others
+    expected = H[:3, :3] - H[:3, 3:5] @ np.linalg.solve(H[3:5, 3:5], H[3:5, :3])
+    np.testing.assert_allclose(least_squares.eliminate(H, g, 3)[0], expected, rtol=1e-9)
+
+
+def test_damped_step_is_newtons_without_damping_and_short_with_it():
+    rng = np.random.default_rng(6)
+    H, g = random_information(rng, 5), rng.normal(size=5)
+    step, gain = least_squares.damped_step(H, g, 0.0)
+    np.testing.assert_allclose(step, np.linalg.solve(H, -g), rtol=1e-9)
+    assert gain == pytest.approx(-g @ step)
+    damped, less = least_squares.damped_step(H, g, 1e3)
+    np.testing.assert_allclose(damped, np.linalg.solve(H + 1e3 * np.diag(np.diag(H)), -g))
+    assert 0.0 < less < gain
+    assert least_squares.damped_step(-H, g, 0.0)[1] < 0.0
+
+
+def test_groups_are_solved_as_their_matrices_one_by_one():
+    rng = np.random.default_rng(7)
+    matrices = np.array([random_information(rng, 4) for _ in range(9)])
+    right = rng.normal(size=(9, 4))
+    own, values = np.ascontiguousarray(np.moveaxis(matrices, 0, 2)), right.T.copy()
+    factors, lower = np.zeros_like(own), np.empty_like(values)
+    least_squares.factor_groups(own, factors)
+    least_squares.solve_lower_groups(factors, values, lower)
+    roots = np.linalg.cholesky(matrices)
+    np.testing.assert_allclose(lower.T, np.linalg.solve(roots, right[..., None])[..., 0])
+    least_squares.solve_upper_groups(factors, lower)
+    np.testing.assert_allclose(lower.T, np.linalg.solve(matrices, right[..., None])[..., 0])
+
+
+def test_covariance_by_groups_is_that_of_correlated_errors():
+    """Of a mean per unknown: groups of four equal errors count as one observation each."""
+    rng = np.random.default_rng(8)
+    groups, found = 30, []
+    J = rng.normal(size=(groups, 4, 2))
+    curvatures = np.einsum('gki,gkj->gij', J, J)
+    nothing = np.zeros((2, 2))
+    inverse = np.linalg.inv(curvatures.sum(axis=0))
+    true = sum(inverse @ j.sum(axis=0)[:, None] @ j.sum(axis=0)[None] @ inverse for j in J)
+    for _ in range(400):
+        r = np.repeat(rng.normal(size=groups), 4).reshape(groups, 4)
+        r = r - J @ (inverse @ np.einsum('gki,gk->i', J, r))  # at the optimum
+        scores = np.einsum('gki,gk->gi', J, r)
+        found.append(
+            [
+                np.diag(least_squares.grouped_covariance(scores, curvatures, nothing, share))
+                for share in (0.0, least_squares.CR2, least_squares.JACKKNIFE)
+            ]
+        )
+    plain, cr2, jackknife = np.mean(found, axis=0) / np.diag(true)
+    assert (plain < cr2).all() and (cr2 < jackknife).all()
+    np.testing.assert_allclose(cr2, 1.0, atol=0.08)

@@ -25,9 +25,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.least_squares import (
+    damped_step,
+    factor_groups,
+    inverse,
+    solve_lower_groups,
+    solve_upper_groups,
+)
 from rs_relpose_ros.core.losses import cauchy_cost, cauchy_weight
 from rs_relpose_ros.core.triangulate import scaled_depths
-from rs_relpose_ros.estimator.priors import inverse
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
     copy_matrix,
@@ -41,7 +47,6 @@ from rs_relpose_ros.geometry.so3 import (
     tangent_basis,
 )
 from rs_relpose_ros.jit import kernel, small_kernel
-from rs_relpose_ros.solvers.algebra import cholesky, newton_step
 
 Flags = NDArray[np.bool_]
 
@@ -205,7 +210,7 @@ class Normal(NamedTuple):
 
     `of_priors`: their cost. `hessian` (n, n); `tracks` (blocks, n + 1, 3, BLOCK): products of a
     track's unknowns with the path and with its residuals, solved by the Cholesky `factors`
-    (blocks, 6, BLOCK) of its own equations. `scatter` (n, n): of the tracks' parts of the
+    (blocks, 3, 3, BLOCK) of its own equations. `scatter` (n, n): of the tracks' parts of the
     gradient. `squares` (V, blocks, BLOCK): of the residuals [px^2].
     """
 
@@ -327,7 +332,7 @@ def _accumulate(
 ) -> None:
     """Add a block of one frame to the equations.
 
-    Of its tracks: `own` (6, BLOCK) lower triangles; `mixed` (n + 1, 4, BLOCK) products of the
+    Of its tracks: `own` (3, 3, BLOCK), lower triangles; `mixed` (n + 1, 4, BLOCK) products of the
     unknowns `places` (M,) of `rows`, from the residual on, with those of the track and with the
     residual. `whole` (n + 1, n + 1): of the path, with `gram` (M, M) as room.
     """
@@ -336,12 +341,10 @@ def _accumulate(
     for y in range(len(places)):
         for x in range(len(places)):
             whole[places[y], places[x]] += gram[y, x]
-    count = 0
     for y in range(_TRACK):
         for x in range(y + 1):
             for i in range(BLOCK):
-                own[count, i] += rows[y, 0, i] * rows[x, 0, i] + rows[y, 1, i] * rows[x, 1, i]
-            count += 1
+                own[y, x, i] += rows[y, 0, i] * rows[x, 0, i] + rows[y, 1, i] * rows[x, 1, i]
     for x in range(len(places)):
         for y in range(_TRACK + 1):
             row, other, to = rows[_RESIDUAL + x], rows[y], mixed[places[x], y]
@@ -351,30 +354,22 @@ def _accumulate(
 
 @small_kernel
 def _eliminate(own: Array, rho: Array, mixed: Array, factors: Array, solved: Array) -> None:
-    """Cholesky `factors` L (6, BLOCK) of the tracks' equations, ``solved = L^-1 mixed``.
+    """Write Cholesky `factors` L (3, 3, BLOCK) of the tracks' equations and ``L^-1 mixed``.
 
     What is left of the products with the residual is the track's part of the gradient.
     """
     n, weight = len(mixed) - 1, _INVERSE_DISTANCE_SIGMA**-2
     for i in range(BLOCK):
         mixed[n, 2, i] += weight * rho[i]
-        a = 1.0 / math.sqrt(own[0, i] + _FLOOR)
-        b, d = own[1, i] * a, own[3, i] * a
-        c = 1.0 / math.sqrt(own[2, i] + _FLOOR - b * b)
-        e = (own[4, i] - d * b) * c
-        f = 1.0 / math.sqrt(own[5, i] + weight + _FLOOR - d * d - e * e)
-        factors[0, i], factors[1, i], factors[2, i] = a, b, c
-        factors[3, i], factors[4, i], factors[5, i] = d, e, f
-    for x in range(n, -1, -1):
-        of, out = mixed[x], solved[x]
-        for i in range(BLOCK):
-            first = of[0, i] * factors[0, i]
-            second = (of[1, i] - factors[1, i] * first) * factors[2, i]
-            third = (of[2, i] - factors[3, i] * first - factors[4, i] * second) * factors[5, i]
-            out[0, i], out[1, i], out[2, i] = first, second, third
-            of[3, i] -= (
-                first * solved[n, 0, i] + second * solved[n, 1, i] + third * solved[n, 2, i]
-            )
+        own[2, 2, i] += weight
+        for x in range(_TRACK):
+            own[x, x, i] += _FLOOR
+    factor_groups(own, factors)
+    for x in range(n, -1, -1):  # the residual first
+        solve_lower_groups(factors, mixed[x, :_TRACK], solved[x])
+        for y in range(_TRACK):
+            for i in range(BLOCK):
+                mixed[x, _TRACK, i] -= solved[x, y, i] * solved[n, y, i]
 
 
 @kernel
@@ -427,12 +422,13 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma:
     places = np.arange(_PATH - _RESIDUAL + path) - (_PATH - _RESIDUAL)
     places[0] = n
     rows, gram = np.empty((_ROWS, 2, BLOCK)), np.empty((len(places), len(places)))
-    squares, factors = np.empty((V, blocks, BLOCK)), np.empty((blocks, 6, BLOCK))
+    squares, factors = np.empty((V, blocks, BLOCK)), np.empty((blocks, _TRACK, _TRACK, BLOCK))
     solved, scores = np.empty((blocks, n + 1, _TRACK, BLOCK)), np.empty((n, BLOCK))
     whole, scatter, sums = np.zeros((n + 1, n + 1)), np.zeros((n, n)), np.empty((n + 1, n + 1))
     product = np.empty((n, n))
     for b in range(blocks):
-        own, mixed = np.zeros((6, BLOCK)), np.zeros((n + 1, 4, BLOCK))
+        own = np.zeros((_TRACK, _TRACK, BLOCK))
+        mixed = np.zeros((n + 1, _TRACK + 1, BLOCK))
         for v in range(V):
             _observe(
                 tracks.observations[v, b],
@@ -504,26 +500,20 @@ def moved_state(state: PathState, normal: Normal, step: Array) -> PathState:
             for x in range(n):
                 for i in range(BLOCK):
                     own[y, i] += solved[x, y, i] * step[x]
+        solve_upper_groups(L, own)
         for i in range(BLOCK):
-            third = own[2, i] * L[5, i]
-            second = (own[1, i] - L[4, i] * third) * L[2, i]
-            first = (own[0, i] - L[1, i] * second - L[3, i] * third) * L[0, i]
             for x in range(3):
-                track[x, i] -= first * track[COLUMNS + x, i] + second * track[COLUMNS + 3 + x, i]
-            track[INVERSE_DISTANCE, i] -= third
+                track[x, i] -= (
+                    own[0, i] * track[COLUMNS + x, i] + own[1, i] * track[COLUMNS + 3 + x, i]
+                )
+            track[INVERSE_DISTANCE, i] -= own[2, i]
     return PathState(t, state.log_scale + step[LOG_SCALE], bias, accelerations, rotations, tracks)
 
 
 @kernel
 def _step(normal: Normal, damping: float) -> Array:
     """Step (n,) of the path; zero if the equations are singular."""
-    n = len(normal.gradient)
-    damped, factor = normal.hessian.copy(), np.zeros((n, n))
-    for k in range(n):
-        damped[k, k] *= 1.0 + damping
-    if not cholesky(damped, factor):
-        return np.zeros(n)
-    step = newton_step(factor, normal.gradient)
+    step, _ = damped_step(normal.hessian, normal.gradient, damping)
     step[LOG_SCALE] = min(max(step[LOG_SCALE], -_LARGEST_STEP), _LARGEST_STEP)
     return step
 

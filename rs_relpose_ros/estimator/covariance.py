@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.core import losses
+from rs_relpose_ros.core.least_squares import adjusted_scores, cholesky, CR2, eliminate, inverse
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
 from rs_relpose_ros.estimator.priors import DW1, PARAMETERS, Priors, SCALE, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel, small_kernel
-from rs_relpose_ros.solvers.algebra import cholesky, newton_step
 
 # Regions of the field that the matches cover: columns and rows.
 REGIONS = (4, 3)
@@ -86,47 +86,31 @@ def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
 def score_of_matches(
     matches: FitMatches, state: TwoViewState, data_hessian: Array, hessian: Array
 ) -> Array:
-    """Covariance of the matches' gradient, by image regions g and by the Hessian.
+    """Covariance (n, n) of the matches' gradient, by image regions and by the Hessian.
 
-    By regions, from their gradients s_g and Hessians H_g::
-
-        sum_g u_g u_g^T,   u_g = (s_g + (I - H_g H^-1)^-1 s_g) / 2
-
-    The fit has adapted to each region, so s_g is too small; the gradient there of a fit without
-    it, ``(I - H_g H^-1)^-1 s_g``, is too large. For independent residuals the mean of the two is
-    right to first order in H_g (as CR2: Bell and McCaffrey, Survey Methodology 28, 2002).
+    The errors of matches in one region of the image may be correlated.
     """
     regions = image_regions(matches)
     weight = 1.0 / (matches.sigma * matches.sigma)
-    n = len(hessian)
-    total, rest, factor = np.zeros((n, n)), np.empty((n, n)), np.zeros((n, n))
-    score = np.zeros(n)
+    count, n = REGIONS[0] * REGIONS[1], len(hessian)
+    scores, curvatures = np.zeros((count, n)), np.zeros((count, n, n))
     filled, cost = 0, 0.0
-    for g in range(REGIONS[0] * REGIONS[1]):
+    for g in range(count):
         use = regions == g
         if not use.any():
             continue
-        filled += 1
         own, gradient, squares = sampson.normal_equations(
             matches.observations, use * matches.weights, state
         )
+        so3.copy_vector(weight * gradient, scores[g])
+        so3.copy_matrix(weight * own, curvatures[g])
+        filled += 1
         cost += weight * squares
-        so3.copy_matrix(hessian, rest)
-        for i in range(PARAMETERS):
-            score[i] = weight * gradient[i]
-            for j in range(PARAMETERS):
-                rest[i, j] -= weight * own[i, j]
-        adjusted = score
-        if cholesky(rest, factor):
-            # (I - H_g H^-1)^-1 s = H (H - H_g)^-1 s
-            adjusted = 0.5 * (score - hessian @ newton_step(factor, score))
-        for i in range(n):
-            for j in range(n):
-                total[i, j] += adjusted[i] * adjusted[j]
+    adjusted = adjusted_scores(scores, curvatures, hessian, CR2)
     # Noise by the residuals alone, without the configured sigma: (units of sigma)^2.
     variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - losses.FITTED, 0.0))
     share = filled / (filled + HESSIAN_REGIONS)
-    return share * total + (1.0 - share) * variance * data_hessian
+    return share * adjusted.T @ adjusted + (1.0 - share) * variance * data_hessian
 
 
 @kernel
@@ -164,10 +148,10 @@ def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -
     chi2, freedom = 0.0, 0.0
     if prior.rotation_information[0, 0] > 0.0:
         theta = so3.log_so3(state.R @ prior.rotation.T)
-        away = (1.0 + LEAST_DISAGREEMENT) * priors.inverse(
-            prior.rotation_information
-        ) - covariance[:3, :3]
-        chi2 += (theta * (priors.inverse(away) @ theta)).sum()
+        away = (1.0 + LEAST_DISAGREEMENT) * inverse(prior.rotation_information) - covariance[
+            :3, :3
+        ]
+        chi2 += (theta * (inverse(away) @ theta)).sum()
         freedom += 3.0
     chi2 += prior.rate_weight * ((state.dw1**2).sum() + (state.dw2**2).sum())
     freedom += 6.0
@@ -179,7 +163,7 @@ def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -
 def local_covariance(matches: FitMatches, state: TwoViewState, prior: Priors) -> Array:
     """Covariance (17, 17) of the local parameters from the regularised Hessian."""
     hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
-    local = priors.inverse(hessian)
+    local = inverse(hessian)
     # Error of a state that is not the optimum: about this step.
     step = local @ gradient
     return np.asarray(local + np.outer(step, step))
@@ -270,17 +254,10 @@ class ImageInformation:
             self, information=self.information / factor, gradient=self.gradient / factor
         )
 
-    def _reduced(self, k: int) -> ImageInformation:
-        """Of the first k deviations."""
-        H, g = self.information, self.gradient
-        # Scaled, so that the rank does not depend on units.
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[k:], np.finfo(float).tiny))
-        rest = np.linalg.pinv(H[k:, k:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
-        gain = H[:k, k:] @ (rest * np.outer(scale, scale))
-        reduced = H[:k, :k] - gain @ H[k:, :k]
-        return replace(
-            self, information=0.5 * (reduced + reduced.T), gradient=g[:k] - gain @ g[k:]
-        )
+    def _reduced(self, kept: int) -> ImageInformation:
+        """Keep the first deviations."""
+        information, gradient = eliminate(self.information, self.gradient, kept)
+        return replace(self, information=information, gradient=gradient)
 
 
 def image_information(
@@ -307,11 +284,8 @@ def _of_pose(matches: FitMatches, state: TwoViewState, prior: Priors) -> tuple[A
         S[i, i] += prior.rate_weight
     for i in range(PARAMETERS):
         S[i, i] += floor
-    weighted = H @ priors.inverse(S)
-    H, g = weighted @ H, weighted @ g
-    gain = H[:POSE, POSE:].copy() @ priors.inverse(H[POSE:, POSE:].copy())
-    reduced = H[:POSE, :POSE] - gain @ H[POSE:, :POSE].copy()
-    return 0.5 * (reduced + reduced.T), g[:POSE] - gain @ g[POSE:]
+    weighted = H @ inverse(S)
+    return eliminate(weighted @ H, weighted @ g, int(POSE))
 
 
 def rotation_information(

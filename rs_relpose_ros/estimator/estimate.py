@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from rs_relpose_ros.config.settings import EstimatorConfig
+from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import Flags, noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import (
@@ -378,7 +379,7 @@ class Estimation:
         )
         of_pose = np.full((6, 6), np.nan)
         # No rotation has a sigma above half a turn: points in one place determine two angles only.
-        fitted = priors.inverse(information + np.eye(3) / np.pi**2)
+        fitted = inverse(information + np.eye(3) / np.pi**2)
         of_gyro = fitted @ self.priors.rotation_information
         of_pose[3:, 3:] = turn1.T @ (fitted + of_gyro @ self._gyro_error() @ of_gyro.T) @ turn1
         # The rates and their covariance are the gyro's.

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.least_squares import damped_step
 from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
-from rs_relpose_ros.solvers.algebra import cholesky, newton_step
 
 # Damping of the first step, as a share of the diagonal of the Hessian.
 FIRST_DAMPING = 1e-4
@@ -74,20 +74,12 @@ def fit(
     state, n = start, priors.unknowns(prior)
     damping = FIRST_DAMPING
     hessian, gradient, cost = with_priors(data, state, prior)
-    damped = np.empty((n, n))
-    factor = np.zeros((n, n))
     for _ in range(iterations):
-        so3.copy_matrix(hessian, damped)
-        for i in range(n):
-            damped[i, i] += damping * hessian[i, i] + 1e-12
-        if not cholesky(damped, factor):
+        step, expected_gain = damped_step(hessian, gradient, damping)
+        if expected_gain < 0.0:  # singular
             damping = max(damping * 10.0, 1e-6)
-            if damping > 1e8:
-                break
             continue
-        step = newton_step(factor, gradient)
-        # Expected gain of the step (Newton's decrement).
-        if -(gradient * step).sum() < LEAST_GAIN * (1.0 + abs(cost)):
+        if expected_gain < LEAST_GAIN * (1.0 + abs(cost)):
             break
         candidate, candidate_prior = priors.moved(state, step), prior
         if n > SCALE:
@@ -115,14 +107,12 @@ def gauss_newton(
 ) -> TwoViewState:
     """The state after some Gauss-Newton steps from `start`, without a test of the cost."""
     state = start
-    factor = np.zeros((PARAMETERS, PARAMETERS))
     for _ in range(steps):
         hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
-        for i in range(PARAMETERS):
-            hessian[i, i] += FIRST_DAMPING * hessian[i, i] + 1e-12
-        if not cholesky(hessian, factor):
+        step, expected_gain = damped_step(hessian, gradient, FIRST_DAMPING)
+        if expected_gain < 0.0:  # singular
             break
-        state = priors.moved(state, newton_step(factor, gradient))
+        state = priors.moved(state, step)
     return state
 
 
@@ -157,7 +147,7 @@ def _refine_part(
 ) -> tuple[TwoViewState, float]:
     """Levenberg-Marquardt over the unknowns from `first` to before `end`; also the cost."""
     hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    factor, step = np.zeros((end - first, end - first)), np.zeros(PARAMETERS)
+    step = np.zeros(PARAMETERS)
     candidate, cost, damping = state, math.inf, FIRST_DAMPING
     for _ in range(60):
         data = linearised(matches, candidate)
@@ -172,12 +162,12 @@ def _refine_part(
             gradient[priors.D1 : priors.DW1] += VELOCITY_WEIGHT * d
             for i in range(priors.D1, priors.DW1):
                 hessian[i, i] += VELOCITY_WEIGHT
-        damped = hessian[first:end, first:end].copy()
-        for i in range(end - first):
-            damped[i, i] += damping * damped[i, i] + 1e-12
-        if not cholesky(damped, factor):
+        part, expected_gain = damped_step(
+            hessian[first:end, first:end].copy(), gradient[first:end], damping
+        )
+        if expected_gain < 0.0:  # singular
             break
-        step[first:end] = newton_step(factor, gradient[first:end])
+        step[first:end] = part
         candidate = priors.moved(state, step)
     return state, cost
 
@@ -220,7 +210,6 @@ def fit_rotation(
     """
     R = start.copy()
     information = np.zeros((3, 3))
-    factor = np.zeros((3, 3))
     # Noise of two coordinates in each of two images.
     weight = focal * focal / (2.0 * sigma * sigma)
     scale2 = 4.0
@@ -248,9 +237,7 @@ def fit_rotation(
         for i in range(3):
             hessian[i, i] += floor
         information = hessian
-        if not cholesky(hessian, factor):
-            break
-        step = newton_step(factor, gradient)
+        step, _ = damped_step(hessian, gradient, 0.0)  # zero if the matrix is singular
         R = so3.exp_so3(step) @ R
         if np.abs(step).max() < 1e-7:
             break

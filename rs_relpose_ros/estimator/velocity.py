@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_relpose_ros.config.settings import CarrierMotion, MOTIONS
+from rs_relpose_ros.core.least_squares import eliminate, inverse, log_determinant
 from rs_relpose_ros.core.losses import Flags, noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import priors, sampson
@@ -146,7 +147,7 @@ def _known_velocities(data: DataTerm, state: TwoViewState, prior: Priors) -> flo
     for i in range(PARAMETERS):
         for j in range(PARAMETERS):
             hessian[i, j] += data.hessian[i, j]
-    return min(max(6.0 - (priors.inverse(hessian) * of_prior).sum(), 0.0), 6.0)
+    return min(max(6.0 - (inverse(hessian) * of_prior).sum(), 0.0), 6.0)
 
 
 @kernel
@@ -175,10 +176,7 @@ def _candidate(
     behind = sampson.count_behind(matches, used.weights > 0.0, state)
     cost += behind * (threshold / used.sigma) ** 2
     evidence = (
-        -0.5 * cost
-        - 0.5 * priors.log_determinant(hessian)
-        + 6.0 * log_scale
-        + scales.log_weights[k]
+        -0.5 * cost - 0.5 * log_determinant(hessian) + 6.0 * log_scale + scales.log_weights[k]
     )
     return state, log_scale, data, hessian, evidence
 
@@ -242,19 +240,19 @@ def _average(
     between_fits = np.zeros((n, n))
     for k in range(size):
         if likely[k]:
-            rest, fitted = away[k] - mean, priors.inverse(hessians[k])
+            rest, fitted = away[k] - mean, inverse(hessians[k])
             for i in range(n):
                 for j in range(n):
                     within_fits[i, j] += weights[k] * fitted[i, j]
                     between_fits[i, j] += weights[k] * rest[i] * rest[j]
     # With the errors of the best one: the misfit of another is no noise.
-    fitted = priors.inverse(hessians[best])
+    fitted = inverse(hessians[best])
     robust = sandwich(used, origin, of_data[best], hessians[best], fitted, prior, gyro_error)
     log_scale = scales.centres[best]
     if n > SCALE:
         log_scale = steps[best, SCALE] + mean[SCALE]
     # Root mean square over the six velocities.
-    sigma = math.sqrt(np.trace(priors.inverse(prior.velocity.information)) / 6.0)
+    sigma = math.sqrt(np.trace(inverse(prior.velocity.information)) / 6.0)
     return Refined(
         priors.moved(origin, mean),
         used.weights > 0.0,
@@ -317,7 +315,7 @@ def expected_velocities(
     prior = VelocityPrior(
         1.0 / interval,
         to_velocities @ expected,
-        priors.inverse(covariance),
+        inverse(covariance),
         float(centres[SCALE_COUNT // 2]),
         0.0,
         (WIDTH * step) ** -2,
@@ -420,13 +418,13 @@ def _without_rotation(
     images: ImageInformation, rotation: Array, information: Array
 ) -> tuple[Array, Array]:
     """Information (8, 8) and gradient (8,) of s and the velocities, the rotation by the gyro."""
-    k, H, g = ROTATION, images.information.copy(), images.gradient.copy()
+    H, g = images.information.copy(), images.gradient.copy()
     theta = so3.log_so3(np.ascontiguousarray(rotation @ images.R.T))
-    H[:k, :k] += information
-    g[:k] -= information @ theta
-    gain = H[k:, :k] @ priors.inverse(np.ascontiguousarray(H[:k, :k]))
-    reduced = H[k:, k:] - gain @ H[:k, k:]
-    return 0.5 * (reduced + reduced.T), g[k:] - gain @ g[:k]
+    H[:ROTATION, :ROTATION] += information
+    g[:ROTATION] -= information @ theta
+    # The rotation last.
+    order = np.roll(np.arange(len(g)), -ROTATION)
+    return eliminate(H[np.ix_(order, order)], g[order], len(g) - ROTATION)
 
 
 @kernel
@@ -441,7 +439,7 @@ def _log_evidence(
         J[i, 2 + i] = 1.0
         away[i] = velocities[i] - prior.rate * t[i % 3]
     WJ = W @ J
-    JWJ, of_prior = J.T @ WJ, 0.5 * priors.log_determinant(W)
+    JWJ, of_prior = J.T @ WJ, 0.5 * log_determinant(W)
     values = np.empty(len(log_b))
     for k in range(len(log_b)):
         b = math.exp(log_b[k])
@@ -450,8 +448,8 @@ def _log_evidence(
         values[k] = (
             6.0 * log_b[k]
             + of_prior
-            - 0.5 * priors.log_determinant(A)
-            + 0.5 * (q * (priors.inverse(A) @ q)).sum()
+            - 0.5 * log_determinant(A)
+            + 0.5 * (q * (inverse(A) @ q)).sum()
             - 0.5 * (u * (W @ u)).sum()
         )
     largest = values.max()

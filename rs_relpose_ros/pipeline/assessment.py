@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import Parameters, SensorConfig
-from rs_relpose_ros.estimator.priors import inverse, log_determinant
+from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator import priors
 from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
-from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
+from rs_relpose_ros.estimator.priors import PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, derotate, TwoViewProblem
 from rs_relpose_ros.estimator.sampling import translation_direction
 from rs_relpose_ros.estimator.sampson import jacobian, residuals

@@ -97,42 +97,6 @@ def null_direction(rows: Array) -> tuple[Vector, float]:
     return best, longest
 
 
-@kernel
-def cholesky(matrix: Array, factor: Array) -> bool:
-    """Write the lower Cholesky factor of a symmetric matrix; False if there is none."""
-    n = matrix.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not value > 0.0:
-                    return False
-                factor[i, i] = math.sqrt(value)
-            else:
-                factor[i, j] = value / factor[j, j]
-    return True
-
-
-@kernel
-def newton_step(factor: Array, gradient: Array) -> Array:
-    """Solve ``L L^T x = -gradient`` with the Cholesky factor L."""
-    n = gradient.shape[0]
-    x = np.empty(n)
-    for i in range(n):
-        x[i] = -gradient[i]
-    for i in range(n):
-        for k in range(i):
-            x[i] -= factor[i, k] * x[k]
-        x[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= factor[k, i] * x[k]
-        x[i] /= factor[i, i]
-    return x
-
-
 # Real roots of polynomials. The roots of the derivative divide the line into intervals on which
 # the polynomial is monotonic, and each interval has at most one root. Applied from the linear
 # derivative upwards, this isolates **all** real roots without a start value and without division

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from rs_relpose_ros.core.least_squares import cholesky, newton_step
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
@@ -26,7 +27,7 @@ from rs_relpose_ros.geometry.so3 import (
     rotated_back,
 )
 from rs_relpose_ros.jit import inlined_kernel, kernel, KernelInterface, small_kernel
-from rs_relpose_ros.solvers.algebra import cholesky, lu_factor, lu_solve, newton_step, normalise
+from rs_relpose_ros.solvers.algebra import lu_factor, lu_solve, normalise
 
 
 class Sample(NamedTuple):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from rs_relpose_ros.core.least_squares import cholesky, newton_step
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers import algebra, common
@@ -152,8 +153,8 @@ def _reach_rank_8(sample: Sample, factors: common.RowTimeFactors, R: Array, y: A
                 return common.polish(sample, factors, axes, R, y, 8)
             hessian = system.T @ system
             gradient = -(system.T @ right)
-        algebra.cholesky(hessian + damping * damped, factor)
-        so3.multiply(so3.exp_so3(algebra.newton_step(factor, gradient)[:3]), R, R_new)
+        cholesky(hessian + damping * damped, factor)
+        so3.multiply(so3.exp_so3(newton_step(factor, gradient)[:3]), R, R_new)
     return False
 
 
