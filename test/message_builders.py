@@ -11,6 +11,7 @@ import pytest
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.pipeline.findings import Code, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 
 Types = Callable[[str], Any]
@@ -268,3 +269,20 @@ def _other_array(values: np.ndarray, way: int, value: int) -> np.ndarray:
     if way == 2:
         return np.concatenate([values, values])
     return np.zeros((0, 1, 9, 65, 1000)[value % 5], dtype=values.dtype)
+
+
+# Its text holds ';' and quotes.
+WRONG_AXES = Finding(
+    Code.AXES,
+    FindingState.WRONG,
+    Why.GROSS,
+    (0.0,),
+    (90.0,),
+    unit='deg',
+    settings={'quat_cam_imu_xyzw': [0.5, -0.5, 0.5, -0.5]},
+)
+WRONG_AXES_TEXT = (
+    'rotation axes of the images are 90 deg from those of the gyro by quat_cam_imu_xyzw; about '
+    '[0.5, -0.5, 0.5, -0.5] fits: refine it with "rs_relpose calibrate" (a static transform with '
+    'parent imu holds the inverse)'
+)

@@ -509,4 +509,4 @@ def test_pairs_that_contradict_the_gyro_have_no_pose_but_reveal_the_reason(row, 
     ]
     assert sum('contradict' in pair.pose.reason for pair in pairs) >= 4
     assert not any(pair.pose or pair.pose.rotation_known for pair in pairs)
-    assert {fault.quantity for fault in pairs[-1].health.faults} & named
+    assert {fault.code for fault in pairs[-1].health.faults} & named

@@ -24,7 +24,16 @@ from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check import check_bag, quantity_findings
 from rs_relpose_ros.offline.check_recording import Stamps
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, QUANTITIES
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    QUANTITIES,
+    Why,
+)
+from rs_relpose_ros.pipeline.findings_text import text_of
 from rs_relpose_ros.tracking.images import Pixels
 
 START, TYPES = 1_700_000_000_000_000_000, build.rosbags_types
@@ -51,7 +60,7 @@ def checked(path, parameters=None, **topics):
         report = check_bag(
             bag, bag.choose_topics(topics), parameters or Parameters.from_mapping(GIVEN)
         )
-    return {finding.quantity: finding for finding in report.findings}, report
+    return {finding.code: finding for finding in report.findings}, report
 
 
 class Small:
@@ -124,10 +133,10 @@ def broken(**changes):
 def test_a_good_bag_has_no_warning(tmp_path):
     findings, report = checked(Small().write(tmp_path / 'bag'))
     # The camera does not move: but for the bias nothing is known, and nothing of that is ok.
-    assert {f.quantity for f in report.findings if f.state is not FindingState.OK} == {
+    assert {f.code for f in report.findings if f.state is not FindingState.OK} == {
         'pairs',
         'gyro at rest',
-        *(quantity.name for quantity in QUANTITIES),
+        *(quantity.code for quantity in QUANTITIES),
     } - {'gyro_bias'}
     assert {f.state for f in report.findings} == {FindingState.OK, FindingState.UNKNOWN}
     assert findings['image rate'].measured['rate_hz'] == pytest.approx(10.0)
@@ -372,8 +381,8 @@ def test_the_bundled_bag_is_good(bundled_bag, parameters):
     findings, report = checked(bundled_bag, parameters)
     assert {f.state for f in report.findings} <= {FindingState.OK, FindingState.UNKNOWN}
     for quantity in QUANTITIES:
-        finding = findings[quantity.name]
-        assert finding.as_check_json()['figures']['figure'] == quantity.name
+        finding = findings[quantity.code]
+        assert finding.as_json()['figures']['figure'] == quantity.code
         assert finding.observable
         assert abs(finding.estimated - finding.configured) < 4.0 * finding.sigma
     assert findings['time_offset'].sigma < 2e-3
@@ -397,7 +406,7 @@ def test_parameters_that_contradict_the_recording(
     # Parameters that the node would track are evaluated as configured.
     tracking = {'track_time_offset': True, 'track_readout_time': True}
     findings, report = checked(short_bag, parameters.updated(tracking | changes))
-    assert [f.quantity for f in report.findings if f.state is F] == [name]
+    assert [f.code for f in report.findings if f.state is F] == [name]
     assert report.failed
     assert findings[name].estimated == pytest.approx(truth, abs=tolerance)
     if 'readout' in name:
@@ -416,7 +425,7 @@ def test_messages_that_contradict_each_other(bundled_bag, parameters, tmp_path):
     findings, _ = checked(path, parameters)
     assert findings['focal_length'].state in (W, F), findings['focal_length']
     assert findings['focal_length'].estimated == pytest.approx(450.0, abs=10.0)
-    assert FindingState.OK not in {findings[quantity.name].state for quantity in QUANTITIES}
+    assert FindingState.OK not in {findings[quantity.code].state for quantity in QUANTITIES}
 
 
 def test_missing_parameters_are_estimated(short_bag):
@@ -428,7 +437,7 @@ def test_missing_parameters_are_estimated(short_bag):
     assert 'cam x = -imu y, cam y = -imu z, cam z = +imu x' in findings['axes'].message
     assert 'bottom' in findings['axes'].message  # direction of gravity
     readout = findings['readout_time']
-    assert (readout.configured, readout.estimated) == (None, pytest.approx(0.03, abs=2e-3))
+    assert (readout.configured, readout.seen) == (None, pytest.approx(0.03, abs=2e-3))
     assert abs(findings['time_offset'].estimated) < 3e-3
     assert findings['rolling shutter'].measured['readout_s'] == pytest.approx(0.03, abs=2e-3)
 
@@ -446,10 +455,22 @@ def test_missing_parameters_are_estimated(short_bag):
 )
 def test_a_certain_deviation_counts_though_no_pose_suffers(state, estimated, expected):
     """By its sigma (1 ms) and its limit of 12 ms."""
-    finding = Finding('time_offset', FindingState(state), '', '', 4e-3, estimated, 1e-3, 's', True)
+    finding = Finding(
+        Code.TIME_OFFSET,
+        FindingState(state),
+        {'ok': Why.CONSISTENT, 'unknown': Why.NOT_OBSERVABLE}.get(state, Why.OFF),
+        (4e-3,),
+        () if estimated is None else (estimated,),
+        1e-3,
+        's',
+        evidence=Evidence(shift=2.0),
+        settings={'time_offset': estimated},
+    )
     (found,) = quantity_findings(Assessment((finding,)), '')
     assert found.state.verdict == expected
-    assert bool(found.fix) is (found.state is not finding.state or expected == 'failure')
+    further = found.fix.removeprefix(text_of(finding).fix)
+    raised = state == 'ok' and expected != 'ok'
+    assert bool(further) is (raised or expected == 'failure')
 
 
 @pytest.mark.parametrize(
@@ -464,15 +485,18 @@ def test_a_certain_deviation_counts_though_no_pose_suffers(state, estimated, exp
 )
 def test_limits_are_in_the_units_of_the_quantity(name, configured, estimated, state):
     finding = Finding(
-        name,
+        Code(name),
         W,
-        '',
-        '',
-        configured,
-        estimated,
+        Why.OFF,
+        (configured,),
+        (estimated,),
         0.01 * configured + 1e-3,
         {'axes': 'deg', 'focal_length': 'px'}.get(name, 's'),
-        True,
+        evidence=Evidence(shift=2.0),
+        settings={
+            'axes': {'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]},
+            'readout_direction': {'readout_direction': 'up'},
+        }.get(name, {}),
     )
     assert next(quantity_findings(Assessment((finding,)), '')).state is state
 
@@ -541,20 +565,20 @@ def test_a_calibration_contradicts_wrong_parameters_in_every_convention(conventi
     unknown = found_by(*convention, offset_observable=False)
     assert contradictions(unknown, *convention, time_offset=0.2) == ()
     (offset,) = contradictions(found, *convention, time_offset=0.01)
-    assert (offset.quantity, offset.configured) == ('time_offset', 0.01)
-    assert offset.estimated == pytest.approx(-0.03, abs=1e-6)
-    assert offset.fix == 'set time_offset: -0.0300'
+    assert (offset.code, offset.told) == ('time_offset', 0.01)
+    assert offset.seen == pytest.approx(-0.03, abs=1e-6)
+    assert text_of(offset).fix == 'set time_offset: -0.0300'
     (readout,) = contradictions(found, *convention, readout_time=0.05)
-    assert (readout.quantity, readout.configured) == ('readout_time', pytest.approx(0.05))
-    assert readout.estimated == pytest.approx(0.024, abs=1e-9)
+    assert (readout.code, readout.told) == ('readout_time', pytest.approx(0.05))
+    assert readout.seen == pytest.approx(0.024, abs=1e-9)
     (axes,) = contradictions(found, *convention, quat_cam_imu_xyzw=(0.0, 0.0, 0.0, 1.0))
-    assert axes.quantity == 'axes' and axes.estimated == pytest.approx(120.0)
-    assert axes.fix == 'set quat_cam_imu_xyzw: [0.5, -0.5, 0.5, -0.5]'
+    assert axes.code == 'axes' and axes.seen == pytest.approx(120.0)
+    assert text_of(axes).fix == 'set quat_cam_imu_xyzw: [0.5, -0.5, 0.5, -0.5]'
     row, direction, exposure = convention
     if row == 'middle':  # which keeps its time
         (reverse,) = contradictions(found, row, {'down': 'up', 'up': 'down'}[direction], exposure)
-        assert reverse.quantity == 'readout_direction'
-        assert reverse.fix == f'set readout_direction: {direction}'
+        assert reverse.code == 'readout_direction'
+        assert text_of(reverse).fix == f'set readout_direction: {direction}'
 
 
 # -- recordings ------------------------------------------------------------------------------
@@ -573,7 +597,7 @@ def test_recordings_of_real_cameras(converted, name):
     path = converted(name)
     findings, report = checked(path, read_parameters(f'{path}.yaml'))
     assert not report.failed
-    assert {f.quantity for f in report.findings if f.state is W} <= REAL[name]
+    assert {f.code for f in report.findings if f.state is W} <= REAL[name]
     assert findings['axes'].state in (FindingState.OK, FindingState.UNKNOWN)
     if 'realsense' in name:
         # Automatic exposure: stamps of varying interval are no times of arrival.
@@ -588,7 +612,7 @@ def test_gross_errors_in_little_light(converted):
     path = converted('realsense_rgb_rs_b')
     findings, report = checked(path, read_parameters(f'{path}.yaml', ['time_offset=-0.0305']))
     # The stamp of another row makes nearly the same offset.
-    assert {f.quantity for f in report.findings if f.state is F} - {'stamp_row'} == {'time_offset'}
+    assert {f.code for f in report.findings if f.state is F} - {'stamp_row'} == {'time_offset'}
     assert findings['time_offset'].estimated == pytest.approx(-0.0635, abs=6e-3)
 
 

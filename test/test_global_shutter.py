@@ -614,7 +614,7 @@ def test_gross_errors_are_found_without_relpose_node(bundled_bag, turn, change, 
         }
     )
     found = watched(bundled_bag, parameters, change)
-    named = [health.faults[0].quantity if health.faults else '' for health in found]
+    named = [health.faults[0].code if health.faults else '' for health in found]
     assert set(named) == {'', quantity} and named[-1] == quantity
     # Within 3 s of the walk.
     assert not quantity or named.index(quantity) < 90

@@ -12,6 +12,7 @@ import cv2
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import fault_stream as faults
 from fault_stream import BAG_TOPICS, SECOND, stamp_of
+import message_builders as build
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,6 +24,8 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.messages.incoming import Intake, sensor_messages
 from rs_relpose_ros.offline.replay import outcomes
+from rs_relpose_ros.pipeline.findings import Assessment
+from rs_relpose_ros.pipeline.findings_text import message_json
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
 
@@ -167,15 +170,15 @@ def test_diagnostics_count_all_frames(session):
     assert session.output.count('[WARN]') <= 2 and '[ERROR]' not in session.output
 
 
-def status_of_relpose(state: str) -> DiagnosticArray:
+def status_of_relpose(health: Assessment) -> DiagnosticArray:
     return DiagnosticArray(
         status=[
             DiagnosticStatus(
                 name='/relpose_node: relative pose',
                 hardware_id=BAG_TOPICS['image'],
                 values=[
-                    KeyValue(key='health', value=state),
-                    KeyValue(key='health_findings', value=f'axes ok: a; readout_time {state}: b'),
+                    KeyValue(key='health', value=health.state.value),
+                    KeyValue(key='findings', value=message_json(health)),
                 ],
             )
         ]
@@ -217,10 +220,10 @@ def test_images_of_a_wrong_calibration_are_suppressed(ros_domain_id, bundled_bag
         assert (values['health'], values['health_source']) == ('wrong', 'own watch')
         assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
         relpose = graph.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        relpose.publish(status_of_relpose('ok'))
+        relpose.publish(status_of_relpose(Assessment(())))
         count = len(infos)
         faults.play(publishers, messages[:200], later=20.0)
         wait_until(lambda: len(infos) > count + 5, 'images', node)
-        relpose.publish(status_of_relpose('wrong'))
+        relpose.publish(status_of_relpose(Assessment((build.WRONG_AXES,))))
         faults.play(publishers, messages[:200], later=30.0)
-        node.wait_for('readout_time is wrong: b; images are suppressed')
+        node.wait_for(f'axes is wrong: {build.WRONG_AXES_TEXT}; images are suppressed')

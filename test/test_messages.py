@@ -33,7 +33,7 @@ from rs_relpose_ros.messages import incoming, outgoing, transforms
 from rs_relpose_ros.messages.incoming import Intake, repeats, Role, StuckGyro
 from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.transforms import FrameTree, Transform, with_extrinsics
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
+from rs_relpose_ros.pipeline.findings import Assessment, Code, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking.images import CompressedImage, GrayLevels
@@ -831,12 +831,14 @@ def test_pair_messages(types):
 @build.both_types
 @pytest.mark.parametrize(('state', 'level'), [('ok', 0), ('suspect', 1), ('wrong', 2)])
 def test_health_is_published_with_every_pair(types, state, level):
-    finding = Finding('time_offset', FindingState(state), 'as it is')
+    finding = Finding(
+        Code.TIME_OFFSET, FindingState(state), Why.CONSISTENT, (0.0,), (0.004,), 0.0005, 's'
+    )
     messages = build.pair_messages(replace(pair(), health=Assessment((finding,))), types)
     values = values_of(messages)
     assert (values['health'], values['health_findings']) == (
         state,
-        f'time_offset {state}: as it is',
+        f'time_offset {state}: estimated 4.00 +- 0.50 ms, active 0.00 ms',
     )
     assert messages['pairs'].status[0].level in (level, bytes([level]))
     assert published_pair(messages).health == state

@@ -27,7 +27,23 @@ from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.pipeline import assessment, findings, recursion
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, worst_of
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+    worst_of,
+)
+from rs_relpose_ros.pipeline.findings_text import (
+    line,
+    message_json,
+    one_line,
+    read_message_json,
+    summary_json,
+    text_of,
+)
 from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonitor, Tracked
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
@@ -334,7 +350,15 @@ def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0)
 def faults_of(sums):
     """Gross errors by rotations alone."""
     gross = assessment.gross_errors(sums.compared(), 0.0, CONFIGURED)
-    return assessment.assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED).faults
+    health = assessment.assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED)
+    return received(health).faults
+
+
+def received(health):
+    """The findings after a message, with the same texts."""
+    found = read_message_json(message_json(health))
+    assert found == health and one_line(found) == one_line(health)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -353,8 +377,8 @@ def test_images_on_their_side_are_offered_as_reason(axis, angle, named):
     if named.endswith(' clockwise'):
         np.testing.assert_allclose(turn @ [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], atol=1e-12)
     faults = faults_of(rotations(turn))
-    assert faults[0].quantity == 'axes'
-    others = [fault.message for fault in faults if fault.quantity == 'image_geometry']
+    assert faults[0].code == 'axes'
+    others = [text_of(fault).message for fault in faults if fault.code == 'image_geometry']
     assert len(others) == bool(named) and all(text.endswith(named) for text in others)
 
 
@@ -369,7 +393,7 @@ def test_a_gross_error_persists_until_it_is_contradicted():
         (independent, 'gyro_unit'),
     ):
         found = assessment.gross_errors(compared, 0.0, CONFIGURED, found)
-        assert found[0].quantity == named
+        assert found[0].code == named
     assert not assessment.gross_errors(rotations(np.eye(3)).compared(), 0.0, CONFIGURED, found)
 
 
@@ -384,7 +408,7 @@ def test_a_gross_error_persists_until_it_is_contradicted():
 def test_clocks_that_differ_by_seconds_are_named(ahead, message):
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()
     fault = assessment.gross_errors(independent, ahead, CONFIGURED)[0]
-    assert (fault.message == message and fault.quantity == 'time_offset') is bool(message)
+    assert (text_of(fault).message == message and fault.code == 'time_offset') is bool(message)
     # An image that comes late, with a stamp that is right.
     assert not assessment.gross_errors(rotations(np.eye(3)).compared(), ahead, CONFIGURED)
 
@@ -401,7 +425,7 @@ def test_an_accelerometer_in_g_is_named_after_a_second():
         finding = sums.finding()
         assert (finding is not None) is named
         if named:
-            assert finding.quantity == 'accel_scale' and 'these are g' in finding.message
+            assert finding.code == 'accel_scale' and 'these are g' in text_of(finding).message
     assert not force_fault(np.array([[0.0, 9.8, 1.0]] * 9))
 
 
@@ -430,9 +454,9 @@ def test_a_gyro_with_little_more_than_its_bias(rotating):
         by_gyro = math.radians(1.0) * by_images if rotating else 1e-4 * rng.normal(size=3)
         sums.add(stamp_ns, interval, by_images, by_gyro + interval * np.array([0.02, -0.01, 0.01]))
     faults = faults_of(sums)
-    assert [fault.quantity for fault in faults] == (['gyro_unit'] if rotating else [])
+    assert [fault.code for fault in faults] == (['gyro_unit'] if rotating else [])
     if rotating:
-        assert faults[0].estimated == pytest.approx(math.degrees(1.0), rel=0.02)
+        assert faults[0].seen == pytest.approx(math.degrees(1.0), rel=0.02)
 
 
 def test_a_steady_translation_is_no_rotation():
@@ -458,7 +482,7 @@ def test_a_constant_rate(noise, still):
             (not still) * steady + 1e-3 * rng.normal(size=3),
             steady + noise * rng.normal(size=3),
         )
-    assert [fault.quantity for fault in faults_of(sums)] == (
+    assert [fault.code for fault in faults_of(sums)] == (
         ['image_geometry', 'time_offset'] if still else []
     )
 
@@ -471,8 +495,8 @@ def test_left_handed_axes_are_no_rotation(axis):
     sums = rotations(R @ np.diag(signs) @ R.T, count=80, noise=0.035)
     assert sums.compared().is_left_handed
     (fault,) = faults_of(sums)
-    assert fault.quantity == 'axes'
-    assert f'wrong sign of {"xyz"[axis]}' in fault.message
+    assert fault.code == 'axes'
+    assert f'wrong sign of {"xyz"[axis]}' in text_of(fault).message
     # About one axis both fit equally.
     assert not rotations(np.eye(3), weights=[0.0, 1.0, 0.0]).compared().is_left_handed
 
@@ -481,7 +505,7 @@ def test_axes_are_wrong_though_most_rotation_is_about_their_axis():
     """Half a turn about the vertical leaves the yaw of a vehicle as it is."""
     sums = rotations(np.diag([-1.0, 1.0, -1.0]), weights=[0.15, 1.0, 0.15])
     assert sums.compared().left_as_configured < 0.3
-    assert 'axes' in {fault.quantity for fault in faults_of(sums)}
+    assert 'axes' in {fault.code for fault in faults_of(sums)}
 
 
 def test_too_little_rotation_is_not_compared():
@@ -527,9 +551,10 @@ EFFECT = assessment.Effect(
 
 
 def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
-    return assessment.assess(
+    health = assessment.assess(
         estimated, assessment.find_inconsistencies(estimated, [effect], configured), (), configured
     )
+    return received(health)
 
 
 @pytest.mark.parametrize(
@@ -543,7 +568,7 @@ def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
 )  # not certain
 def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
     found = assessment.find_inconsistencies(calibration(c, SIGMA, coupled), [EFFECT], CONFIGURED)
-    assert {one.quantity.name for one in found} == named
+    assert {one.quantity.code for one in found} == named
     if named:
         # The prior of free quantities is wide, not absent.
         np.testing.assert_allclose(sum(one.deviation for one in found), c, rtol=0.01)
@@ -561,9 +586,10 @@ def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
 )
 def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named):
     faults = assessed(calibration(deviation(offset=0.01), SIGMA, correlation)).faults
-    assert {fault.quantity for fault in faults} == named
+    assert {fault.code for fault in faults} == named
     assert all(
-        ('time_offset or readout_time' in fault.fix) is (len(named) > 1) for fault in faults
+        ('time_offset or readout_time' in text_of(fault).fix) is (len(named) > 1)
+        for fault in faults
     )
 
 
@@ -592,7 +618,7 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
     """An offset within three of its sigmas is consistent, and explains what the readout seems."""
     estimated = calibration(deviation(offset=0.01), SIGMA, 0.99)
     known = replace(CONFIGURED, sigmas=np.where(np.arange(DEVIATIONS) == OFFSET, 0.005, 0.0))
-    assert {fault.quantity for fault in assessed(estimated).faults} == {'time_offset'}
+    assert {fault.code for fault in assessed(estimated).faults} == {'time_offset'}
     assert not assessed(estimated, configured=known).faults
     # Before any pair: the whole configured sigma, without doubts about other parameters.
     small = assessment.configured_sigmas(
@@ -624,9 +650,9 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
 def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
     """A remark, no finding of its own."""
     (fault,) = assessed(calibration(deviation(offset=size), SIGMA)).faults
-    assert fault.quantity == 'time_offset'
-    assert ('stamp_row' in fault.fix) is bool(row)
-    assert not row or f'(stamp_row: {row} is equivalent)' in fault.fix
+    assert fault.code == 'time_offset'
+    assert ('stamp_row' in text_of(fault).fix) is bool(row)
+    assert not row or f'(stamp_row: {row} is equivalent)' in text_of(fault).fix
 
 
 @pytest.mark.parametrize(
@@ -635,14 +661,14 @@ def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
 def test_the_state_follows_the_shift_of_the_pose(size, state):
     health = assessed(calibration(deviation(offset=size), SIGMA))
     assert health.state is FindingState(state)
-    (finding,) = (one for one in health.findings if one.quantity == 'time_offset')
-    assert (finding.configured, finding.estimated) == (
+    (finding,) = (one for one in health.findings if one.code == 'time_offset')
+    assert (finding.told, finding.seen) == (
         0.004,
         pytest.approx(0.004 + size, abs=1e-5),
     )
     if state != 'ok':
         assert health.faults == (finding,)
-        assert f'set time_offset: {0.004 + size:.4f}' in finding.fix
+        assert f'set time_offset: {0.004 + size:.4f}' in text_of(finding).fix
 
 
 @pytest.mark.parametrize(
@@ -663,7 +689,7 @@ def test_tracking_is_suggested_if_it_is_off_and_reaches_the_estimate(quantity, s
         assessment.Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
         replace(CONFIGURED, sensor=sensor(**{tracking: on})),
     ).faults[0]
-    assert (f'{tracking}: true' in fault.fix) is offered
+    assert (f'{tracking}: true' in text_of(fault).fix) is offered
 
 
 def test_messages_have_no_negative_zero():
@@ -672,7 +698,7 @@ def test_messages_have_no_negative_zero():
     )
     health = assessed(calibration(deviation(offset=-1e-6), SIGMA), configured=configured)
     assert health.state is FindingState.OK
-    assert not re.search(r'-0\.0*(\D|$)', health.text)
+    assert not re.search(r'-0\.0*(\D|$)', one_line(health))
 
 
 def test_gross_errors_leave_the_other_quantities_unknown():
@@ -683,12 +709,22 @@ def test_gross_errors_leave_the_other_quantities_unknown():
         assessment.gross_errors(turned, 0.0, CONFIGURED),
         CONFIGURED,
     )
-    assert [finding.quantity for finding in health.faults] == ['axes']
+    assert [finding.code for finding in health.faults] == ['axes']
     assert {finding.state for finding in health.findings[1:]} == {FindingState.UNKNOWN}
 
 
-def finding(quantity, state, estimated=1.0, sigma=0.1):
-    return Finding(quantity, state, 'a', 'b', 0.5, estimated, sigma, 's', True)
+def finding(code, state, seen=1.0, why=Why.OFF):
+    return Finding(
+        Code(code),
+        state,
+        Why.NOT_OBSERVABLE if state is UNKNOWN else why,
+        (0.5,),
+        (seen,),
+        0.1,
+        's',
+        evidence=Evidence(shift=2.0),
+        settings={code: seen},
+    )
 
 
 OK, UNKNOWN, SUSPECT, WRONG = FindingState
@@ -698,33 +734,49 @@ def test_the_worst_of_a_run():
     run = findings.NOT_EVALUATED
     assert run.state is UNKNOWN
     for states in ((UNKNOWN, OK), (OK, SUSPECT), (UNKNOWN, WRONG), (OK, SUSPECT)):
-        run = worst_of(run, Assessment(tuple(map(finding, 'ab', states))))
-    assert {one.quantity: one.state for one in run.findings} == {'a': OK, 'b': WRONG}
+        found = map(finding, ('time_offset', 'readout_time'), states)
+        run = worst_of(run, Assessment(tuple(found)))
+    assert [one.state for one in run.findings] == [OK, WRONG]
     assert run.state is WRONG
-    later = worst_of(run, Assessment((finding('b', WRONG, 2.0),)))
-    assert later.faults[0].estimated == 2.0
-    both = Assessment((finding('a', SUSPECT), finding('b', WRONG)))
-    assert both.faults[0].quantity == 'b'
-    assert json.loads(json.dumps(both.as_json()))['findings'][0] == {
-        'figure': 'a',
+    later = worst_of(run, Assessment((finding('readout_time', WRONG, 2.0),)))
+    assert later.faults[0].seen == 2.0
+    both = Assessment((finding('time_offset', SUSPECT), finding('readout_time', WRONG)))
+    assert both.faults[0].code == 'readout_time'
+    assert json.loads(json.dumps(summary_json(both)))['findings'][0] == {
+        'figure': 'time_offset',
         'told': 0.5,
         'seen': 1.0,
         'sigma': 0.1,
         'unit': 's',
         'observable': True,
         'state': 'suspect',
-        'sentence': 'a: b',
+        'sentence': 'estimated 1000.00 +- 100.00 ms, active 500.00 ms (shifts the pose by 2.0 '
+        'sigmas): set time_offset: 1.0000',
+        'code': 'time_offset',
+        'why': 'off',
+        'configured': [0.5],
+        'estimated': [1.0],
+        'evidence': {
+            'sigmas': None,
+            'shift': 2.0,
+            'pairs': None,
+            'log_likelihood': None,
+            'measured': {},
+        },
+        'candidates': [],
+        'parent': None,
+        'settings': {'time_offset': 1.0},
     }
 
 
 def test_traces_of_a_gross_error_are_left_out_of_a_run():
     small = Assessment((finding('gyro_bias', WRONG), finding('focal_length', OK)))
-    gross = Assessment((finding('axes', WRONG, sigma=None), finding('gyro_bias', UNKNOWN)))
+    gross = Assessment((finding('axes', WRONG, why=Why.GROSS), finding('gyro_bias', UNKNOWN)))
     assert not small.is_gross and gross.is_gross
     run = worst_of(worst_of(small, gross), gross)
-    assert [(f.quantity, f.state) for f in run.faults] == [('axes', WRONG)]
+    assert [(f.code, f.state) for f in run.faults] == [('axes', WRONG)]
     # Later findings count.
-    assert [f.quantity for f in worst_of(run, small).faults] == ['axes', 'gyro_bias']
+    assert [f.code for f in worst_of(run, small).faults] == ['axes', 'gyro_bias']
 
 
 # -- tracked parameters --------------------------------------------------------------------------
@@ -814,7 +866,7 @@ def test_pairs_that_contradict_the_accelerometer():
             sums.add(next(stamps), InertialEvidence(*evidence))
         found = sums.finding()
         assert sums.contradicts is bool(fix)
-        assert (found is None) if fix is None else fix in found.fix
+        assert (found is None) if fix is None else fix in text_of(found).fix
     assert found.state is OK
 
 
@@ -941,23 +993,19 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
     flagged = [
         k
         for k, result in enumerate(results)
-        if {fault.quantity for fault in result.health.faults} - ({'accel_axes'} - right)
+        if {fault.code for fault in result.health.faults} - ({'accel_axes'} - right)
     ]
     assert flagged, 'no finding'
-    named = [[fault.quantity for fault in results[k].health.faults] for k in (flagged[0], -1)]
+    named = [[fault.code for fault in results[k].health.faults] for k in (flagged[0], -1)]
     assert any(len(names) <= 2 and right & set(names) for names in named), named
     if case.estimated is not None:
-        fault = next(
-            fault for fault in results[flagged[-1]].health.faults if fault.quantity in right
-        )
-        assert fault.estimated == pytest.approx(
-            case.estimated, abs=4.0 * fault.sigma + case.tolerance
-        )
+        fault = next(fault for fault in results[flagged[-1]].health.faults if fault.code in right)
+        assert fault.seen == pytest.approx(case.estimated, abs=4.0 * fault.sigma + case.tolerance)
     for k, result in enumerate(results):
         state, pose = result.health.state, result.pose
         if state is FindingState.WRONG:
             assert not pose
-            assert result.health.faults[0].text == pose.reason or (
+            assert line(result.health.faults[0]) == pose.reason or (
                 pose.status is not Status.WITHHELD
             )
         if pose and k >= flagged[0]:

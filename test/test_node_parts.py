@@ -26,10 +26,18 @@ from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.nodes import diagnostics, executor
-from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Silence, Statistics, WARN
+from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Reason, Silence, Statistics, WARN
 from rs_relpose_ros.nodes.executor import KeptWaitSet
 from rs_relpose_ros.nodes.parameters import NodeParameters
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+)
+from rs_relpose_ros.pipeline.findings_text import line, message_json, text_of
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
@@ -81,17 +89,21 @@ class Lines(list[tuple[str, str]]):
         )
 
 
-def finding(state: FindingState, ms: float, quantity: str = 'time_offset') -> Finding:
+def finding(
+    state: FindingState, ms: float, code: Code = Code.TIME_OFFSET, why: Why = Why.OFF
+) -> Finding:
     return Finding(
-        quantity,
+        code,
         state,
-        f'estimated {ms} ms, active 30.0 ms',
-        f'set {quantity}: {1e-3 * ms}',
-        0.03,
-        1e-3 * ms,
+        why,
+        (0.03,),
+        (1e-3 * ms,),
         0.0005,
         's',
-        True,
+        evidence=Evidence(shift=2.0),
+        settings={'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
+        if code is Code.AXES
+        else {'time_offset': 1e-3 * ms},
     )
 
 
@@ -109,15 +121,15 @@ def test_health_is_logged_once_a_quantity_and_when_it_is_ok_again(clock):
         lines.log(health, withhold=True)
     levels, texts = zip(*lines, strict=True)
     assert levels == ('warn', 'error')
-    assert texts[0] == suspect.faults[0].text
-    assert texts[1].startswith(f'{wrong.faults[0].text}; ')
+    assert texts[0] == line(suspect.faults[0])
+    assert texts[1].startswith(f'{line(wrong.faults[0])}; ')
     # The worst parameter first; the repetitions of a line are those of its first parameter.
-    small = finding(FindingState.WRONG, 9.0, 'axes')
+    small = finding(FindingState.WRONG, 9.0, Code.AXES)
     lines.log(Assessment((suspect.faults[0], small)), withhold=False)
-    assert lines[2][1].startswith(f'{small.text}; {suspect.faults[0].text}; ')
+    assert lines[2][1].startswith(f'{line(small)}; {line(suspect.faults[0])}; ')
     assert ['suppressed' in text for text in (texts[1], lines[2][1])] == [True, False]
     # A gross error of the same quantity has a line of its own.
-    gross = replace(small, sigma=None)
+    gross = replace(small, why=Why.GROSS)
     for fault in (small, gross, gross):
         lines.log(Assessment((fault,)), withhold=True)
     for health in (unknown, ok):
@@ -145,14 +157,19 @@ def test_why_no_image_comes(image, published, fix):
 def test_why_there_is_no_result():
     refused = {Refusal.IMU_GAP: 100, Refusal.NO_IMU: 30}
     why = diagnostics.why_nothing
-    reason = why(Silence(5.0, 150, refused, 'PURE_ROTATION: at rest'))
+    reason = why(Silence(5.0, 150, refused, Reason('PURE_ROTATION', 'PURE_ROTATION: at rest')))
     assert '130 of 150 ' in reason.text and '100 of them as imu_gap' in reason.text
     # Most images are used, and their pairs have no pose.
-    standing = why(Silence(5.0, 150, {Refusal.IMU_GAP: 20}, 'PURE_ROTATION: 0.1 px'))
+    standing = why(
+        Silence(5.0, 150, {Refusal.IMU_GAP: 20}, Reason('PURE_ROTATION', 'PURE_ROTATION: 0.1 px'))
+    )
     assert 'PURE_ROTATION: 0.1 px' in standing.text
     # The numbers of a reason change, its kind does not.
-    assert standing.kind == why(Silence(6.0, 180, {}, 'PURE_ROTATION: 0.2 px')).kind
-    assert len({reason.kind, standing.kind, why(Silence(5.0, 150, {}, '')).kind}) == 3
+    assert (
+        standing.kind
+        == why(Silence(6.0, 180, {}, Reason('PURE_ROTATION', 'PURE_ROTATION: 0.2 px'))).kind
+    )
+    assert len({reason.kind, standing.kind, why(Silence(5.0, 150, {})).kind}) == 3
 
 
 def test_silence_is_counted_from_the_last_result(clock, statistics):
@@ -171,7 +188,7 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
     assert silence(90, no_imu=10).seconds == 0.0
     clock.now = 66 * SECOND
     assert silence(150, no_imu=12) == Silence(
-        2.0, 60, {Refusal.NO_IMU: 2}, 'LOW_PARALLAX: at rest'
+        2.0, 60, {Refusal.NO_IMU: 2}, Reason('LOW_PARALLAX', 'LOW_PARALLAX: at rest')
     )
 
 
@@ -318,6 +335,9 @@ def test_refused_frames_are_reported_once(statistics):
     assert third.text.endswith('CameraInfo is for 640x480')
 
 
+CONSISTENT = Finding(
+    Code.TIME_OFFSET, FindingState.OK, Why.CONSISTENT, (0.0,), (0.004,), 0.0005, 's'
+)
 # Besides the refusals.
 EXPECTED = {
     'state': 'degraded',
@@ -356,7 +376,8 @@ EXPECTED = {
     'tracked_readout_time_sigma_ms': '0.70',
     'applied_readout_time_ms': '0.80',
     'health': 'ok',
-    'health_findings': 'time_offset ok: 4 ms',
+    'health_findings': 'time_offset ok: estimated 4.00 +- 0.50 ms, active 0.00 ms',
+    'findings': message_json(Assessment((CONSISTENT,))),
     'latency_p50_ms': '15.0',
     'latency_p99_ms': '15.0',
     'frame_time_p50_ms': '30.0',
@@ -370,11 +391,10 @@ def test_every_counter_has_its_own_field(clock, statistics):
     """All different, so that none can stand for another."""
     refused = {reason: 100 + k for k, reason in enumerate(Refusal)}
     for _ in range(3):
-        statistics.add_failure('a frame failed')
-    offset = Finding('time_offset', FindingState.OK, '4 ms', '', 0.0, 0.004, 0.0005, 's', True)
+        statistics.add_failure(Reason('a frame failed', 'a frame failed: it has no rows'))
     last = replace(
         pair(Status.LOW_PARALLAX, 'at rest'),
-        health=Assessment((offset,)),
+        health=Assessment((CONSISTENT,)),
         tracked=Tracked(
             gyro_bias=np.array([0.01, -0.02, 0.03]),
             gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
@@ -466,11 +486,11 @@ def test_level_and_text_of_the_health(statistics, state, level, shown):
     found = report(statistics)
     fields = dict(found.values)
     assert (found.level, fields['state'], fields['health']) == (level, shown, state.value)
-    assert (found.text == fault.text) is bool(level)
-    assert fault.description in fields['health_findings']
+    assert (found.text == line(fault)) is bool(level)
+    assert text_of(fault).description in fields['health_findings']
     # Refused frames do not hide that poses are wrong, nor that nothing is published.
     dropping = report(statistics, counted=counts(9, 4, overload=5))
-    assert (dropping.text == fault.text) is (state is FindingState.WRONG)
+    assert (dropping.text == line(fault)) is (state is FindingState.WRONG)
     assert report(statistics, problem='no image').text == 'no image'
 
 

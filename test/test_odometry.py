@@ -35,8 +35,9 @@ from rs_relpose_ros.odometry.offline import (
     write_tum,
 )
 from rs_relpose_ros.odometry.pair import deviations, KeyframePair
-from rs_relpose_ros.odometry.states import Base, ContinuousPath, OdometryState
+from rs_relpose_ros.odometry.states import Base, ContinuousPath, Notice, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
+from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
 
 START_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -293,7 +294,7 @@ def test_start_at_rest_is_at_once():
     estimator, out = run(given)
     assert estimator.starts[0].at_rest
     assert estimator.starts[0].seconds < 0.5
-    assert any('at rest' in message for message in estimator.warnings())
+    assert any('at rest' in notice.text for notice in estimator.warnings())
     standing = [keyframe for keyframe in out if seconds_of(keyframe.imu_ns) < 1.8]
     assert len(standing) > 5
     assert np.linalg.norm(positions(standing) - standing[0].position, axis=1).max() < 0.01
@@ -373,7 +374,7 @@ def test_without_a_fault_there_is_no_blocking_reason(walked, tracked):
 def test_a_lever_arm_of_zero_is_a_warning():
     at_camera = PARAMETERS.updated({'imu_position': (0.0, 0.0, 0.0)})
     [warning] = OdometryEstimator(at_camera).warnings()
-    assert warning.startswith('imu_position is zero')
+    assert warning.text.startswith('imu_position is zero')
 
 
 def test_order_of_messages_does_not_matter(walked, tracked):
@@ -583,7 +584,8 @@ def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
     assert estimator.counts['contradicting'] > 5
     longest = PARAMETERS.odometry.max_coast + INTERVAL
     assert all(seconds_of(one.imu_ns) < 6.0 + longest for one in out if not one.path)
-    assert 'lost: no usable pair for 2 s' in estimator.warnings()
+    lost = Notice('lost: no usable pair for 2 s', OdometryState.LOST)
+    assert lost in estimator.warnings()
 
 
 def test_pairs_that_are_wrong_together_count_by_their_innovations():
@@ -727,7 +729,7 @@ def test_a_graph_that_is_not_solved_is_lost_and_the_path_continues(walked, monke
     monkeypatch.setattr(gtsam, 'BatchFixedLagSmoother', Flaky)
     estimator, out = run(walked, pairs=contradicting(walked.pairs))
     lost = 'lost: the graph cannot be solved: Indeterminant linear system'
-    assert any(warning.startswith(lost) for warning in estimator.warnings())
+    assert any(notice.text.startswith(lost) for notice in estimator.warnings())
     assert estimator.state is not OdometryState.LOST
     assert out[-1].path == estimator.counts['lost'] > 0
     assert len(estimator.smoothed()) >= len(out)
@@ -745,14 +747,14 @@ def test_a_path_that_cannot_be_smoothed_is_left_out_with_a_warning(walked, monke
     assert out
     assert estimator.smoothed() == []
     [warning] = estimator.warnings()
-    assert warning.startswith('not smoothed: ')
-    assert 'Indeterminant linear system' in warning
+    assert warning.text.startswith('not smoothed: ')
+    assert 'Indeterminant linear system' in warning.text
 
 
 def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
     estimator, out = run(walked, pairs=without(walked.pairs, 3, 6))
     assert (estimator.counts['lost'], len(estimator.starts)) == (1, 2)
-    assert any('lost' in message for message in estimator.warnings())
+    assert OdometryState.LOST in [notice.state for notice in estimator.warnings()]
     before, after = ([k for k in out if k.path == path] for path in (0, 1))
     assert np.trace(after[0].pose_covariance[:3, :3]) > np.trace(
         before[-1].pose_covariance[:3, :3]
@@ -789,7 +791,7 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
     ]
     estimator, second = run(walked, pairs=pairs, samples=samples, estimator=estimator)
     assert estimator.counts['lost'] == 1
-    [lost] = [text for text in estimator.warnings() if text.startswith('lost')]
+    [lost] = [text for text, state in estimator.warnings() if state is OdometryState.LOST]
     assert lost == 'lost: ' + (
         'the clock of the IMU was set back'
         if seconds < 0.0
@@ -867,14 +869,22 @@ def test_an_imu_of_another_frame_gives_no_path_and_the_reason(walked, turn):
         assert estimator.reason.startswith('pairs and IMU contradict each other')
         assert [
             text
-            for text in (*estimator.warnings(), estimator.blocking_reason)
+            for text in (
+                *(notice.text for notice in estimator.warnings()),
+                estimator.blocking_reason,
+            )
             if 'quat_cam_imu_xyzw' in text
         ]
 
 
 def test_pairs_that_are_wrong_together_do_not_disprove_axes(walked):
     """As of a moving object; before 20 pairs have agreed with the IMU they do."""
-    finding = 'accel_axes suspect: accelerometer inconsistent with the images'
+    finding = Finding(
+        Code.ACCEL_AXES,
+        FindingState.SUSPECT,
+        Why.OFF,
+        evidence=Evidence(log_likelihood=-20.0),
+    )
     for begin, lost in ((2.0, 1), (8.0, 0)):
         estimator, out = run(
             walked,
@@ -902,7 +912,7 @@ def test_loss_is_reported_without_further_pairs(walked):
         )
         assert estimator.state is state, age
     assert estimator.counts['lost'] == 1
-    assert estimator.warnings()[-1] == 'lost: no usable pair for 2 s'
+    assert estimator.warnings()[-1].text == 'lost: no usable pair for 2 s'
     assert [one.state.value for one in estimator.intervals] == ['tracking', 'uncertain', 'lost']
     uncertain = estimator.intervals[1]
     assert 0.25 < (uncertain.begin_ns - walked.pairs[19].stamp_ns) / SECOND - ROW < 0.31

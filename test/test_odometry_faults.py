@@ -25,6 +25,7 @@ from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
 import rclpy
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -59,7 +60,7 @@ from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import Base
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
+from rs_relpose_ros.pipeline.findings import Assessment, Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # The node may have to compile the kernels.
@@ -86,7 +87,7 @@ QUIET = {
     'camera stops': (CAMERA_STOPS[0] + 2.0 + 0.2, CAMERA_STOPS[1]),
     'told wrong': (WRONG[0] + 0.3, WRONG[1]),
 }
-WRONG_HEALTH = Assessment((Finding('time_offset', FindingState.WRONG, 'off'),))
+WRONG_HEALTH = Assessment((Finding(Code.TIME_OFFSET, FindingState.WRONG, Why.INDEPENDENT),))
 
 
 def within(seconds: float, span: tuple[float, float]) -> bool:
@@ -140,20 +141,49 @@ def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
 
 
 @pytest.mark.parametrize(
-    'quantity, state, stops',
+    'code, state, why, stops',
     [
-        ('accel_axes', FindingState.SUSPECT, True),
-        ('accel_axes', FindingState.OK, False),
-        ('time_offset', FindingState.SUSPECT, False),
-        ('time_offset', FindingState.WRONG, True),
+        (Code.ACCEL_AXES, FindingState.SUSPECT, Why.OPPOSITE, True),
+        (Code.ACCEL_AXES, FindingState.OK, Why.CONSISTENT, False),
+        (Code.TIME_OFFSET, FindingState.SUSPECT, Why.OFF, False),
+        (Code.TIME_OFFSET, FindingState.WRONG, Why.OFF, True),
     ],
 )
-def test_a_contradicted_accelerometer_stops_the_path(quantity, state, stops):
-    health = Assessment((Finding(quantity, state, 'because'),))
+def test_a_contradicted_accelerometer_stops_the_path(code, state, why, stops):
+    finding = Finding(
+        code,
+        state,
+        why,
+        (0.0,),
+        (0.01,),
+        1e-3,
+        's',
+        evidence=Evidence(shift=2.0, log_likelihood=-20.0),
+        settings={'time_offset': 0.01},
+    )
+    unknown = Finding(Code.AXES, FindingState.UNKNOWN, Why.NOT_OBSERVABLE)
+    health = Assessment((unknown, finding))
     pair = walk('walk:2', 1.0).pairs[0]
-    expected = f'{quantity} {state.value}: because' if stops else ''
+    expected = finding if stops else None
     assert KeyframePair.of_result(pair_result(pair, health)).contradiction == expected
     assert KeyframePair.of_message(pairs_message(pair, health)).contradiction == expected
+
+
+def test_a_path_ends_with_the_whole_text_of_a_finding():
+    """Of wrong axes it holds ';' and quotes, and all of it comes over ~/pairs."""
+    given = walk('walk:2', 8.0)
+    estimator = OdometryEstimator(PARAMETERS)
+    for sample in given.samples:
+        estimator.add_imu(sample)
+    for pair in given.pairs[:-1]:
+        estimator.add_pair(KeyframePair.of_message(pairs_message(pair, Assessment(()))))
+    estimator.take(end=True)
+    estimator.warnings()
+    wrong = pairs_message(given.pairs[-1], Assessment((build.WRONG_AXES,)))
+    received = deserialize_message(serialize_message(wrong), DiagnosticArray)
+    estimator.add_pair(KeyframePair.of_message(received))
+    estimator.take(end=True)
+    assert estimator.warnings()[-1].text == f'lost: axes wrong: {build.WRONG_AXES_TEXT}'
 
 
 # Values of a message on ~/pairs that no relpose_node publishes, and what is said of them.
@@ -166,6 +196,10 @@ BAD_PAIRS = {
     'no rotation': ('image_rotation_xyzw', '0 0 0 0', 'image_information of ~/pairs'),
     'infinite baseline': ('baseline_m', 'inf', 'baseline_m of ~/pairs must be finite'),
     'backwards in time': ('current_imu_ns', str(START_NS - SECOND), 'must be later than'),
+    'no findings': ('findings', '', 'findings of a message'),
+    'another cause': ('findings', '[{"code": "the moon"}]', 'findings of a message'),
+    'nested findings': ('findings', '[' * 90_000, 'findings of a message'),
+    'another state': ('health', 'wrong', 'health of ~/pairs must be unknown'),
     'far in the future': ('current_imu_ns', str(START_NS + 1000 * SECOND), 'less than 100 s'),
 }
 

@@ -125,9 +125,7 @@ def on_recording(path: Path, parameter_file: Path) -> list[Suggestion]:
         }[wrong.quantity]
         size = abs(wrong.error(right)) / reference.sigma if reference and reference.sigma else 0.0
         estimated, sigma = (
-            (math.nan, math.nan)
-            if last is None
-            else (last.estimated or 0.0, last.sigma or math.nan)
+            (math.nan, math.nan) if last is None else (last.seen or 0.0, last.sigma or math.nan)
         )
         results.append(Suggestion(path.name, name, size, right, estimated, sigma, ' '.join(named)))
     return results
@@ -156,11 +154,11 @@ def _findings(path: Path, parameters: Parameters) -> tuple[dict[str, Finding], d
     with open_bag(path) as bag:
         run = Replay(bag, bag.find_topics(needs_camera_info=False), parameters)
         for assessment in (*(pair.health for pair in run.pairs()), run.health):
-            named.update({finding.quantity: finding for finding in assessment.faults})
+            named.update({finding.code.value: finding for finding in assessment.faults})
     return named, {
-        finding.quantity: finding
+        finding.code.value: finding
         for finding in run.health.findings
-        if finding.quantity not in named
+        if finding.code.value not in named
     }
 
 

@@ -447,7 +447,7 @@ def evaluated(recording: Recording, pair: PairResult, seconds: float) -> Evaluat
     pose = pair.pose
     verdict = (
         pair.health.state.value,
-        tuple(finding.quantity for finding in pair.health.findings if finding.state in FLAGGED),
+        tuple(finding.code.value for finding in pair.health.findings if finding.state in FLAGGED),
     )
     truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns) if pose else None
     if truth is None or not np.linalg.norm(truth[1]) > 0.0:

@@ -28,7 +28,8 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
-from rs_relpose_ros.pipeline.findings import BY_NAME
+from rs_relpose_ros.pipeline.findings import Code
+from rs_relpose_ros.pipeline.findings_text import with_sigma
 from rs_relpose_ros.pipeline.rotations import LEAST_RAYS
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -431,8 +432,8 @@ def _bounded(
             ),
         )
     readout, sigma = float(unknowns.parameters[k]), math.sqrt(covariance[k, k])
-    found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
-        abs(readout), sigma
+    found = 'the readout time is estimated as ' + with_sigma(
+        Code.READOUT_TIME, abs(readout), sigma
     )
     if abs(readout) - 3.0 * sigma > interval:
         raise InputError(

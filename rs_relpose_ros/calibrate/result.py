@@ -14,7 +14,8 @@ from rs_relpose_ros.config.files import parameter_text, SourcedValue
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
-from rs_relpose_ros.pipeline.findings import BY_NAME
+from rs_relpose_ros.pipeline.findings import Code
+from rs_relpose_ros.pipeline.findings_text import with_sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +183,7 @@ def quantities(
         rows += [
             (
                 'focal length',
-                BY_NAME['focal_length'].with_sigma(
-                    camera.fx * focal.value, camera.fx * focal.sigma
-                ),
+                with_sigma(Code.FOCAL_LENGTH, camera.fx * focal.value, camera.fx * focal.sigma),
                 focal,
             ),
             ('distortion', text, radial),
@@ -230,7 +229,7 @@ def _rounded(estimate: Estimate, digits: int, factor: float = 1.0) -> str:
 
 def _shown(name: str, estimate: Estimate, value: float | None = None) -> str:
     """A quantity with its sigma; `value` replaces its own."""
-    return BY_NAME[name].with_sigma(estimate.value if value is None else value, estimate.sigma)
+    return with_sigma(Code(name), estimate.value if value is None else value, estimate.sigma)
 
 
 def _shutter_text(result: CalibrationResult) -> str:

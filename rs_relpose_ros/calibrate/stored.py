@@ -12,7 +12,8 @@ from rs_relpose_ros.config.files import file_values, read_parameters
 from rs_relpose_ros.config.settings import StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.output_files import written
-from rs_relpose_ros.pipeline.findings import BY_NAME
+from rs_relpose_ros.pipeline.findings import Code
+from rs_relpose_ros.pipeline.findings_text import with_sigma
 
 # Section of the file that identifies the camera; a node of another name ignores it.
 _SECTION = 'rs_relpose_calibration'
@@ -128,7 +129,7 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
         )
     known = [
         f'{name.replace("_", " ")} '
-        + BY_NAME[name].with_sigma(values[name], values[f'{name}_sigma'])
+        + with_sigma(Code(name), values[name], values[f'{name}_sigma'])
         for name in ('readout_time', 'time_offset')
         if f'{name}_sigma' in values
     ]

@@ -20,6 +20,7 @@ from rs_relpose_ros.odometry.rows import camera_poses, ROWS_FILE, RowTrajectory,
 from rs_relpose_ros.offline import replay
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import beside, refuse_existing, refuse_unwritable, SUMMARY_FILE
+from rs_relpose_ros.pipeline import findings_text
 
 TUM = 'tum'
 
@@ -134,7 +135,7 @@ def _print_health(outcome: replay.ReplayOutcome) -> None:
     """A line for each inconsistent parameter, or else one for all parameters."""
     health = outcome.health
     for fault in health.faults:
-        print(fault.text)
+        print(findings_text.line(fault))
     if health.faults:
         return
     if not health.findings:
@@ -142,7 +143,7 @@ def _print_health(outcome: replay.ReplayOutcome) -> None:
         return
     observed, unobserved = (
         ', '.join(
-            finding.quantity for finding in health.findings if finding.observable is observable
+            finding.code.value for finding in health.findings if finding.observable is observable
         )
         for observable in (True, False)
     )

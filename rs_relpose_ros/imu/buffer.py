@@ -152,23 +152,32 @@ _LEAST_RANGE = 1.5
 
 
 class ForceFault(str):
-    """Reason why an accelerometer is no specific force, and what to do, after a colon."""
+    """Reason why an accelerometer gives no specific force, with the mean length of its samples."""
+
+    fix = 'it must be specific force in m/s^2 (REP-145)'
+
+    def __new__(cls, length: float) -> 'ForceFault':
+        """`length`: mean length of the samples [m/s^2]."""
+        hint = ''
+        if abs(length - 1.0) < 0.15:
+            hint = ', these are g'
+        elif length < 0.5 * STANDARD_GRAVITY:
+            hint = ', gravity is removed'
+        message = (
+            f'the accelerometer reads {length:.3g} m/s^2 in the mean, not {STANDARD_GRAVITY}{hint}'
+        )
+        fault = super().__new__(cls, f'{message}: {cls.fix}')
+        fault.length, fault.message = length, message
+        return fault
+
+    length: float
+    message: str
 
 
-def length_fault(length: float) -> str:
-    """`ForceFault` of forces of this mean length [m/s^2]; empty if it may be that of gravity."""
+def length_fault(length: float) -> ForceFault | None:
+    """The fault of forces of this mean length [m/s^2]; None if it may be the one of gravity."""
     low, high = (bound * STANDARD_GRAVITY for bound in _LIKELY_LENGTHS)
-    if low <= length <= high:
-        return ''
-    hint = (
-        ', these are g'
-        if abs(length - 1.0) < 0.15
-        else (', gravity is removed' if length < 0.5 * STANDARD_GRAVITY else '')
-    )
-    return ForceFault(
-        f'the accelerometer reads {length:.3g} m/s^2 in the mean, not '
-        f'{STANDARD_GRAVITY}{hint}: it must be specific force in m/s^2 (REP-145)'
-    )
+    return None if low <= length <= high else ForceFault(length)
 
 
 def force_fault(forces: Array) -> str:

@@ -21,6 +21,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import info_field
+from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
 from rs_relpose_ros.tracking.images import Pixels
@@ -94,7 +95,7 @@ class PairValue(NamedTuple):
 
     key: str
     # Time: a timestamp [ns]; reals: any number of them. An unknown value is an empty text.
-    kind: Literal['text', 'time', 'real', 'vector', 'reals']
+    kind: Literal['text', 'time', 'real', 'vector', 'reals', 'findings']
     of: Callable[[PairResult], Any]
     field: str = ''
 
@@ -102,6 +103,8 @@ class PairValue(NamedTuple):
         """The value as in the message."""
         if self.kind == 'real':
             return number(value)
+        if self.kind == 'findings':
+            return findings_text.message_json(value)
         if self.kind in ('vector', 'reals'):
             return '' if value is None else ' '.join(map(number, value))
         return str(value)
@@ -110,6 +113,8 @@ class PairValue(NamedTuple):
         """The value of a text; unknown numbers are NaN. InputError if it is malformed."""
         if self.kind == 'text':
             return text
+        if self.kind == 'findings':
+            return findings_text.read_message_json(text)
         if self.kind == 'time':
             # At most the digits of an int64.
             if not (text.isascii() and text.isdigit() and len(text) < 20):
@@ -187,7 +192,8 @@ PAIR_VALUES = {
         ),
         PairValue('gyro_bias_rad_s', 'vector', lambda pair: pair.gyro_bias, 'gyro_bias'),
         PairValue('health', 'text', lambda pair: pair.health.state.value, 'health'),
-        PairValue('health_findings', 'text', lambda pair: pair.health.text),
+        PairValue('health_findings', 'text', lambda pair: findings_text.one_line(pair.health)),
+        PairValue('findings', 'findings', lambda pair: pair.health),
     )
 }
 TOPICS_KEY = 'topics'

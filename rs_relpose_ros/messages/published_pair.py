@@ -22,6 +22,7 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
+from rs_relpose_ros.pipeline.findings import Assessment
 
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
@@ -88,6 +89,16 @@ class PairStatus:
         if key not in self._texts:
             raise InputError(f'~/pairs must have the key {key}')
         return self._texts[key]
+
+    def findings(self) -> Assessment:
+        """The findings on the calibration; InputError if they are not those of its state."""
+        health: Assessment = self['findings']
+        if self['health'] != health.state.value:
+            raise InputError(
+                f'health of ~/pairs must be {health.state.value}, as of its findings, '
+                f'got {self["health"][:40]!r}'
+            )
+        return health
 
     def images(self) -> ImageInformation | None:
         """The estimate of the images alone; None if there is none."""

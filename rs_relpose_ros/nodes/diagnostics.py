@@ -18,6 +18,7 @@ from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
+from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
@@ -40,6 +41,13 @@ _COMPRESSED = '/compressed'
 _JITTER, _ALTERNATING = 5e-4, -0.15
 
 
+class Reason(NamedTuple):
+    """A reason that is logged once while its kind stays."""
+
+    kind: str
+    text: str  # with the details, which may change
+
+
 @dataclass(frozen=True, slots=True)
 class Silence:
     """Inputs since the last result, or since the start."""
@@ -47,14 +55,7 @@ class Silence:
     seconds: float = 0.0
     images: int = 0
     refused: Mapping[Refusal, int] = field(default_factory=dict)
-    failure: str = ''  # reason of the last pair or frame without a result
-
-
-class Reason(NamedTuple):
-    """`kind`: logged once while it stays; `text`: the log line."""
-
-    kind: str
-    text: str
+    failure: Reason | None = None  # of the last pair or frame without a result
 
 
 def why_no_image(image: str, published: Collection[str]) -> Reason:
@@ -90,8 +91,8 @@ def why_nothing(silence: Silence) -> Reason:
         )
     if silence.failure:
         return Reason(
-            silence.failure.partition(':')[0],
-            f'nothing for {PATIENCE:g} s; the last reason: {silence.failure}',
+            silence.failure.kind,
+            f'nothing for {PATIENCE:g} s; the last reason: {silence.failure.text}',
         )
     return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
 
@@ -199,7 +200,8 @@ class FrameStatistics(ABC):
         self._lock = threading.Lock()
         self._latencies: deque[float] = deque(maxlen=_RECENT_RESULTS)
         self._failures = 0
-        self._last_failure = self._last_refusal = ''
+        self._last_failure: Reason | None = None
+        self._last_refusal = ''
         self._since_ns = clock()
         self._taken = 0  # frames, until the last report
         self._counted: Counter[str] = Counter()
@@ -221,7 +223,7 @@ class FrameStatistics(ABC):
             self._frame_times.append(spent_ns / NANOSECONDS)
             self._busy_ns += spent_ns
 
-    def add_failure(self, reason: str) -> None:
+    def add_failure(self, reason: Reason) -> None:
         """Count a frame whose processing failed."""
         with self._lock:
             self._failures += 1
@@ -292,7 +294,7 @@ class FrameStatistics(ABC):
             for name, seconds in (('latency', self._latencies), ('frame_time', self._frame_times)):
                 values[f'{name}_p50_ms'], values[f'{name}_p99_ms'] = _milliseconds(seconds)
             values['worker_busy_percent'] = f'{100.0 * busy:.0f}'
-            values[self.last] = self._last_failure
+            values[self.last] = self._last_failure.text if self._last_failure else ''
             silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
         return Report(
             level, text, tuple((name, str(value)) for name, value in values.items()), silence
@@ -366,7 +368,8 @@ class Statistics(FrameStatistics):
                 self._last_pose = result
                 self._published(ready_ns)
             else:
-                self._last_failure = f'{result.pose.status.value}: {result.pose.reason}'
+                status = result.pose.status.value
+                self._last_failure = Reason(status, f'{status}: {result.pose.reason}')
 
     def _evaluate_results(self) -> tuple[int, str]:
         last = self._last_pair
@@ -374,13 +377,14 @@ class Statistics(FrameStatistics):
             return OK, 'no keyframe pair yet'
         if last.health.faults:
             worst = last.health.faults[0]
-            return ERROR if worst.state is FindingState.WRONG else WARN, worst.text
+            return ERROR if worst.state is FindingState.WRONG else WARN, findings_text.line(worst)
         if not last.pose:
-            return WARN, f'no pose of the last pair: {self._last_failure}'
+            return WARN, f'no pose of the last pair: {last.pose.status.value}: {last.pose.reason}'
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
 
     def _values(self) -> dict[str, object]:
         last, pose = self._last_pair, self._last_pose
+        health = NOT_EVALUATED if last is None else last.health
         tracked = dict.fromkeys(_TRACKED, '')
         if last is not None and last.tracked is not None and last.tracked.pairs:
             tracked = {name: text(last.tracked, last.applied) for name, text in _TRACKED.items()}
@@ -390,8 +394,9 @@ class Statistics(FrameStatistics):
             **{metric.name: metric.text(last) for metric in PAIR_METRICS},
             'model': pose.pose.diagnostics.model if pose else '',
             **tracked,
-            'health': (NOT_EVALUATED if last is None else last.health).state.value,
-            'health_findings': (NOT_EVALUATED if last is None else last.health).text,
+            'health': health.state.value,
+            'health_findings': findings_text.one_line(health),
+            'findings': findings_text.message_json(health),
         }
 
 
@@ -519,7 +524,7 @@ class HealthLog:
         faults = health.faults
         if faults:
             # Numbers and lesser faults change from pair to pair, the worst parameter hardly.
-            text, kind = '; '.join(fault.text for fault in faults), faults[0].quantity
+            text, kind = '; '.join(map(findings_text.line, faults)), faults[0].code.value
             if health.is_gross:
                 # A gross error has a fix of its own, unlike the first small steps.
                 kind += ', gross'

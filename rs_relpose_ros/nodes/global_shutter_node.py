@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-import re
 import time
 from typing import Any
 
@@ -11,6 +10,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.nodes.diagnostics import (
     ERROR,
@@ -22,8 +22,8 @@ from rs_relpose_ros.nodes.diagnostics import (
 )
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
-from rs_relpose_ros.pipeline import global_shutter
-from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, NOT_EVALUATED
+from rs_relpose_ros.pipeline import findings_text, global_shutter
+from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 
@@ -45,16 +45,9 @@ _DESCRIPTION = (
 
 
 def assessment_of(status: Any) -> Assessment:
-    """Findings of a status of relpose_node on /diagnostics."""
-    texts = {item.key: item.value for item in status.values}.get('health_findings', '')
-    return Assessment(
-        tuple(
-            Finding(quantity, FindingState(state), message)
-            for quantity, state, message in re.findall(
-                rf'(\w+) ({"|".join(FindingState)}): ([^;]*)', texts
-            )
-        )
-    )
+    """Findings of a status of relpose_node on /diagnostics; InputError if they are unusable."""
+    values = {item.key: item.value for item in status.values}
+    return findings_text.read_message_json(values.get('findings', ''))
 
 
 class _Statistics(FrameStatistics):
@@ -89,7 +82,8 @@ class _Statistics(FrameStatistics):
 
     def _evaluate_results(self) -> tuple[int, str]:
         if faults := self._health.faults:
-            return ERROR if faults[0].state is FindingState.WRONG else WARN, faults[0].text
+            level = ERROR if faults[0].state is FindingState.WRONG else WARN
+            return level, findings_text.line(faults[0])
         return OK, f'publishing: {self._images} images' if self._images else 'no image yet'
 
     def _values(self) -> dict[str, object]:
@@ -167,15 +161,16 @@ class GlobalShutterNode(SensorNode):
         """Keep the state of relpose_node on the same images."""
         own = self._image_topic().removesuffix('/compressed')
         for status in message.status:
-            if (
+            if not (
                 status.name.endswith(f': {RELATIVE_POSE}')
                 and status.hardware_id.removesuffix('/compressed') == own
             ):
-                self._of_others = (
-                    time.monotonic(),
-                    assessment_of(status),
-                    status.name.partition(':')[0],
-                )
+                continue
+            node = status.name.removesuffix(f': {RELATIVE_POSE}')
+            try:
+                self._of_others = time.monotonic(), assessment_of(status), node
+            except InputError as error:
+                self._warn(f'the state of {node} is not used: {error}')
 
     def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""

@@ -23,7 +23,7 @@ from rs_relpose_ros.nodes.parameters import legal_qos
 from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
-from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry
+from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, OdometryState
 
 NAME = 'odometry_node'
 
@@ -39,7 +39,12 @@ _SILENCE = 2
 # Time without a sample after which the IMU is silent [s].
 _SILENT_IMU = 0.25
 # Level of diagnostic_msgs/DiagnosticStatus by state.
-_LEVELS = {'starting': 0, 'tracking': 0, 'uncertain': 1, 'lost': 2}
+_LEVELS = {
+    OdometryState.STARTING: 0,
+    OdometryState.TRACKING: 0,
+    OdometryState.UNCERTAIN: 1,
+    OdometryState.LOST: 2,
+}
 _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
     f'subscribes: {_PAIRS}, imu, accel, camera_info, calibration\n'
@@ -253,9 +258,11 @@ class OdometryNode(StoppableNode):
             )
             if self._config.odometry_rate == 0.0:
                 self._publish(keyframe.imu_ns)
-        for text in self._estimator.warnings():
+        logs = self._info, self._warn, self._error
+        for notice in self._estimator.warnings():
             # A change of the state has the level of the state.
-            (self._info, self._warn, self._error)[_LEVELS.get(text.partition(':')[0], 0)](text)
+            level = 0 if notice.state is None else _LEVELS[notice.state]
+            logs[level](notice.text)
 
     def _message(self, odometry: Odometry) -> Any:
         """nav_msgs/Odometry; its twist is in the axes of the child frame."""
@@ -308,7 +315,7 @@ class OdometryNode(StoppableNode):
             )
         self.warn_of_namesake()
         estimator = self._estimator
-        level, state = _LEVELS[estimator.state.value], estimator.state.value
+        level, state = _LEVELS[estimator.state], estimator.state.value
         if estimator.reason:
             state = f'{state}: {estimator.reason}'
         if blocking_reason := estimator.blocking_reason:

@@ -580,7 +580,8 @@ class SensorNode(StoppableNode):
             if self._worker.warm.is_set()
             else 'the kernels cannot be compiled'
         )
-        self._frame_statistics.add_failure(f'{warning}: {outcome.reason}')
+        reason = diagnostics.Reason(warning, f'{warning}: {outcome.reason}')
+        self._frame_statistics.add_failure(reason)
         error = outcome.error
         if isinstance(error, RsRelposeError):
             self._error(f'{warning}: {error}')

@@ -29,14 +29,17 @@ from rs_relpose_ros.odometry.graph import (
     POSE,
     VELOCITY,
 )
-from rs_relpose_ros.odometry.pair import AXES, KeyframePair
+from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import (
     Base,
+    Notice,
     Odometry,
     OdometryState,
     StartReport,
     StateInterval,
 )
+from rs_relpose_ros.pipeline import findings_text
+from rs_relpose_ros.pipeline.findings import Code
 
 # Largest delay of a message.
 _LATE_NS = 100_000_000
@@ -182,12 +185,13 @@ class OdometryEstimator:
         self.starts: list[StartReport] = []
         # Numbers of pairs and runs by outcome.
         self.counts: Counter[str] = Counter()
-        self._warnings: list[str] = []
+        self._warnings: list[Notice] = []
         if not lever.any():
-            self._warnings.append(
-                f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m '
-                'of uncertainty; a measured one is better'
+            text = (
+                f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m of uncertainty; '
+                'a measured one is better'
             )
+            self._warnings.append(Notice(text))
 
     @property
     def waiting(self) -> bool:
@@ -299,7 +303,7 @@ class OdometryEstimator:
         self._waiting, self._camera = {}, ''
         self._change(OdometryState.STARTING, 'reset', self._watched_ns)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """Messages for the log since the last call."""
         warnings, self._warnings = self._warnings, []
         return warnings
@@ -349,7 +353,9 @@ class OdometryEstimator:
             try:
                 states = run.graph.smoothed()
             except GraphError as error:
-                self._warnings.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
+                self._warnings.append(
+                    Notice(f'not smoothed: {len(run.stamps)} keyframes: {error}')
+                )
                 continue
             out.append(
                 [
@@ -381,7 +387,8 @@ class OdometryEstimator:
                     )
                 ]
             except GraphError as error:
-                self._warnings.append(f'loops of {len(run.stamps)} keyframes not added: {error}')
+                text = f'loops of {len(run.stamps)} keyframes not added: {error}'
+                self._warnings.append(Notice(text))
         return taken
 
     # -- pairs -------------------------------------------------------------------------------
@@ -403,9 +410,11 @@ class OdometryEstimator:
         self._offset_ns = pair.stamp_ns - pair.current_ns
         # Pairs that are wrong together, as of a moving object, do not disprove axes.
         proven = self._run is not None and self._run.confirmed >= _PROVEN
-        if pair.contradiction and not (proven and pair.contradiction.startswith(AXES)):
-            self._end(pair.contradiction, pair.current_ns)
-            self._change(OdometryState.LOST, pair.contradiction, pair.current_ns)
+        contradiction = pair.contradiction
+        if contradiction and not (proven and contradiction.code is Code.ACCEL_AXES):
+            reason = findings_text.item(contradiction)
+            self._end(reason, pair.current_ns)
+            self._change(OdometryState.LOST, reason, pair.current_ns)
             self.counts['calibration contradicted'] += 1
             return None
         if pair.images is None:
@@ -682,7 +691,8 @@ class OdometryEstimator:
         if state is self.state:
             return
         self.state = state
-        self._warnings.append(f'{state.value}: {reason}' if reason else state.value)
+        text = f'{state.value}: {reason}' if reason else state.value
+        self._warnings.append(Notice(text, state))
         at_ns = imu_ns + self._offset_ns
         if self._keep:
             if self.intervals:

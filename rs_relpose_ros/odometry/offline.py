@@ -115,7 +115,7 @@ def odometry_into(
     if loops and paths:
         paths, closed, taken = _with_loops(estimator, paths, views, replay, bag, topics)
     smoothed = [keyframe for path in paths for _, keyframe in path]
-    warnings = estimator.warnings()
+    warnings = [notice.text for notice in estimator.warnings()]
     truth = read_truth(bag, topics)
     # The ground truth is that of the camera.
     base = estimator.base or Base()

@@ -21,14 +21,12 @@ from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.published_pair import PairStatus
-from rs_relpose_ros.pipeline.findings import FindingState
+from rs_relpose_ros.pipeline.findings import Assessment, Code, Finding, FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # Difference of a velocity from the mean one, in units of it, from which its information does not
 # hold: it is linearised at the estimated velocity.
 _FAR_VELOCITY = 1.5
-# Begin of a finding on the axes of the accelerometer.
-AXES = f'accel_axes {FindingState.SUSPECT.value}:'
 # Interval that no pair reaches [ns].
 _LONGEST_NS = 100_000_000_000
 
@@ -46,7 +44,7 @@ class KeyframePair:
     baseline: float  # [m]; NaN if unknown
     baseline_log_sigma: float
     gyro_bias: Array  # (3,) [rad/s] active, IMU frame; NaN if unknown
-    contradiction: str  # finding against the calibration that ends a path; empty for none
+    contradiction: Finding | None  # against the calibration: it ends a path
 
     @classmethod
     def of_result(cls, pair: PairResult) -> KeyframePair:
@@ -63,7 +61,7 @@ class KeyframePair:
             pose.baseline,
             pose.baseline_log_sigma,
             bias,
-            _contradiction(pair.health.state.value, pair.health.text),
+            _contradiction(pair.health),
         )
 
     @classmethod
@@ -85,7 +83,7 @@ class KeyframePair:
             status['baseline_m'],
             status['baseline_log_sigma'],
             status['gyro_bias_rad_s'],
-            _contradiction(status['health'], status['health_findings']),
+            _contradiction(status.findings()),
         )
 
     def later(self, delay_ns: int) -> KeyframePair:
@@ -134,17 +132,16 @@ class KeyframePair:
         return self.images is not None and bool(np.isfinite(self.images.t).all())
 
 
-def _contradiction(state: str, findings: str) -> str:
+def _contradiction(health: Assessment) -> Finding | None:
     """The finding that ends a path: a parameter is wrong, or the accelerometer is contradicted.
 
     Pairs continue without the accelerometer, but a path has no other source of scale.
     """
-    for finding in findings.split('; '):
-        if finding.startswith(AXES) or finding.partition(' ')[2].startswith(
-            f'{FindingState.WRONG.value}:'
-        ):
+    for finding in health.findings:
+        suspect = finding.state is FindingState.SUSPECT
+        if finding.state is FindingState.WRONG or (suspect and finding.code is Code.ACCEL_AXES):
             return finding
-    return 'the calibration is wrong' if state == FindingState.WRONG.value else ''
+    return None
 
 
 # Residuals of a pair and their derivatives. Unknowns are pose and velocity of the body (the IMU)

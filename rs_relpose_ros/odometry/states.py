@@ -36,6 +36,13 @@ class OdometryState(str, Enum):
     LOST = 'lost'  # until the next start
 
 
+class Notice(NamedTuple):
+    """A line for the log."""
+
+    text: str
+    state: OdometryState | None = None  # that was entered; None for any other reason
+
+
 class StateInterval(NamedTuple):
     """A state with its reason; times on the camera's clock, None for a state that is not over."""
 

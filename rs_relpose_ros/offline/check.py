@@ -16,19 +16,70 @@ from rs_relpose_ros.calibrate import observations
 from rs_relpose_ros.calibrate.observations import axes_text, frame_times, Varying
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.imu.buffer import length_fault
+from rs_relpose_ros.imu.buffer import ForceFault, length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
+from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.assessment import not_evaluated
-from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    BY_CODE,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    QUANTITIES,
+    Why,
+)
+from rs_relpose_ros.pipeline.findings_text import Text, text_of, with_sigma
 
 OK, UNKNOWN, SUSPECT, WRONG = FindingState
 
 
+class Line(NamedTuple):
+    """A finding in the report, with its text."""
+
+    finding: Finding
+    message: str
+    fix: str = ''
+
+    @property
+    def code(self) -> Code:
+        """What the line is about."""
+        return self.finding.code
+
+    @property
+    def state(self) -> FindingState:
+        """State of the finding."""
+        return self.finding.state
+
+    def as_json(self) -> dict[str, Any]:
+        """The line in `check --json`."""
+        finding = self.finding
+        text = Text(self.message, self.fix)
+        return {
+            'name': finding.code.value,
+            'verdict': finding.state.verdict,
+            'text': self.message,
+            'remedy': self.fix,
+            'figures': dict(finding.evidence.measured)
+            if finding.code.is_property
+            else findings_text.figures(finding, text),
+        } | findings_text.facts(finding)
+
+
+def property_line(
+    code: Code, state: FindingState, message: str, fix: str, measured: Mapping[str, Any]
+) -> Line:
+    """Line on a property of the recording."""
+    why = {OK: Why.CONSISTENT, UNKNOWN: Why.NOT_MEASURED}.get(state, Why.OFF)
+    return Line(Finding(code, state, why, evidence=Evidence(measured=measured)), message, fix)
+
+
 class Case(NamedTuple):
-    """State and fix if a condition holds; `more` follows the message of the finding."""
+    """State and fix if a condition holds; `more` follows the message of the line."""
 
     holds: bool
     state: FindingState
@@ -36,12 +87,12 @@ class Case(NamedTuple):
     more: str = ''
 
 
-def by_case(name: str, message: str, measured: Mapping[str, Any], *cases: Case) -> Finding:
-    """Finding by the first of the `cases` that holds; OK if none does."""
+def by_case(code: Code, message: str, measured: Mapping[str, Any], *cases: Case) -> Line:
+    """Line by the first of the `cases` that holds; OK if none does."""
     for case in cases:
         if case.holds:
-            return Finding(name, case.state, message + case.more, case.fix, measured=measured)
-    return Finding(name, OK, message, measured=measured)
+            return property_line(code, case.state, message + case.more, case.fix, measured)
+    return property_line(code, OK, message, '', measured)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +100,7 @@ class CheckReport:
     """All findings of one bag."""
 
     bag: str
-    findings: tuple[Finding, ...]
+    findings: tuple[Line, ...]
 
     @property
     def failed(self) -> bool:
@@ -58,10 +109,10 @@ class CheckReport:
 
     def lines(self, width: int = 100) -> list[str]:
         """The report as text of at most `width` columns."""
-        names = max(len(finding.quantity) for finding in self.findings)
+        names = max(len(finding.code.value) for finding in self.findings)
         lines = []
         for finding in self.findings:
-            head = f'{finding.state.verdict:<8} {finding.quantity:<{names}}  '
+            head = f'{finding.state.verdict:<8} {finding.code.value:<{names}}  '
             text = finding.message + (f' -> {finding.fix}' if finding.fix else '')
             lines += textwrap.wrap(
                 text,
@@ -82,7 +133,7 @@ class CheckReport:
         return {
             'bag': self.bag,
             'failed': self.failed,
-            'findings': [finding.as_check_json() for finding in self.findings],
+            'findings': [finding.as_json() for finding in self.findings],
         }
 
 
@@ -107,19 +158,19 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if contradiction:
         findings.append(
-            Finding(
-                'transforms',
+            property_line(
+                Code.TRANSFORMS,
                 SUSPECT,
                 contradiction,
                 'correct the description of the robot (URDF), or the parameter',
-                measured={},
+                {},
             )
         )
     if chosen.image is not None:
         findings += [
             *_encoding(scan, chosen.image, parameters),
             _rate(scan.stamps(Role.IMAGE)),
-            stamp_finding('image stamps', scan.stamps(Role.IMAGE), 'the camera'),
+            stamp_finding(Code.IMAGE_STAMPS, scan.stamps(Role.IMAGE), 'the camera'),
             _calibration(scan),
             _transport(scan, chosen.image, bag.reliability(chosen.image)),
         ]
@@ -135,40 +186,40 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     return CheckReport(str(bag.path), tuple(findings))
 
 
-def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Finding:
+def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Line:
     measured = {role: topic and topic.name for role, topic in chosen._asdict().items()}
     needed = ['image', 'imu'] if parameters.intrinsics.given else ['image', 'camera_info', 'imu']
     absent = [role for role in needed if measured[role] is None]
     if not absent:
         return by_case(
-            'topics',
+            Code.TOPICS,
             ', '.join(f'{topic.name} ({topic.count})' for topic in filter(None, chosen)),
             measured,
         )
     there = ', '.join(map(str, bag.topics)) or 'no topics at all'
-    return Finding(
-        'topics',
+    return property_line(
+        Code.TOPICS,
         WRONG,
         f'no {" and no ".join(absent)} topic; the bag has {there}',
         'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu with gyro',
-        measured=measured,
+        measured,
     )
 
 
-def _parameters(parameters: Parameters) -> Finding:
+def _parameters(parameters: Parameters) -> Line:
     sensor, missing = parameters.sensor, parameters.sensor.missing()
     if missing:
-        return Finding(
-            'parameters',
+        return property_line(
+            Code.PARAMETERS,
             SUSPECT,
             f'{" and ".join(missing)} not configured',
             'the node needs them: add --params FILE, or estimate them from a recording '
             'with "rs_relpose calibrate"',
-            measured={'missing': missing},
+            {'missing': missing},
         )
     nearest = axes_text(observations.nearest_axis_map(sensor.R_cam_imu))
     return by_case(
-        'parameters',
+        Code.PARAMETERS,
         f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, '
         f'time_offset {1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about '
         f'{nearest})',
@@ -187,17 +238,17 @@ _MISSED_SHARE = 0.05
 _MOST_STAMPS = 1000
 
 
-def _no_step(name: str, stamps: Stamps, measured: dict[str, Any]) -> Finding:
-    return Finding(
+def _no_step(name: Code, stamps: Stamps, measured: dict[str, Any]) -> Line:
+    return property_line(
         name,
         WRONG,
         f'{stamps.count} message(s), no two of increasing stamps',
         'record longer, and correct the stamps of the driver',
-        measured=measured,
+        measured,
     )
 
 
-def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
+def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
     """Order and evenness of stamps; those of images may follow an exposure."""
     varying, first_ns = Varying.JITTER, np.unique(stamps.ns[:_MOST_STAMPS])
     if of == 'the camera':
@@ -258,10 +309,10 @@ def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
     )
 
 
-def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Finding]:
+def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Line]:
     sizes = ', '.join(f'{width}x{height}' for width, height in scan.sizes)
     found = by_case(
-        'images',
+        Code.IMAGES,
         f'{sizes} {", ".join(scan.encodings)}'.strip(),
         {
             'encodings': dict(scan.encodings),
@@ -293,25 +344,25 @@ def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Finding]
     right = 'compressed' if compressed else 'raw'
     return [
         found,
-        Finding(
-            'transport',
+        property_line(
+            Code.TRANSPORT,
             SUSPECT,
             f'the images are {right}',
             f'set image_transport: {right} for the live node (replay detects it)',
-            measured={'image_transport': right},
+            {'image_transport': right},
         ),
     ]
 
 
-def _rate(stamps: Stamps) -> Finding:
-    name, interval, duration = 'image rate', stamps.interval, stamps.duration
+def _rate(stamps: Stamps) -> Line:
+    name, interval, duration = Code.IMAGE_RATE, stamps.interval, stamps.duration
     if not interval > 0.0:
-        return Finding(
+        return property_line(
             name,
             WRONG,
             f'{stamps.count} image(s) of different stamps or fewer',
             'record at least some seconds',
-            measured={'count': stamps.count},
+            {'count': stamps.count},
         )
     # Each longer step hides frames; 1.5 of a step occurs even with automatic exposure.
     gaps, longest = int((stamps.forwards > 1.7 * interval).sum()), stamps.longest
@@ -344,17 +395,17 @@ def _rate(stamps: Stamps) -> Finding:
     )
 
 
-def _calibration(scan: Scan) -> Finding:
-    name, intrinsics = 'calibration', scan.intrinsics
+def _calibration(scan: Scan) -> Line:
+    name, intrinsics = Code.CALIBRATION, scan.intrinsics
     if intrinsics is None:
-        return Finding(
+        return property_line(
             name,
             WRONG,
             scan.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
             'calibrate the camera (camera_calibration, OpenCV) and have its driver '
             'publish the CameraInfo, or set camera_matrix: "rs_relpose calibrate" '
             'estimates its focal length',
-            measured={},
+            {},
         )
     size = intrinsics.image_width, intrinsics.image_height
     other = next(iter(scan.sizes), size) if size not in scan.sizes else size
@@ -393,11 +444,11 @@ def _calibration(scan: Scan) -> Finding:
     )
 
 
-def _transport(scan: Scan, topic: Topic, reliability: str) -> Finding:
+def _transport(scan: Scan, topic: Topic, reliability: str) -> Line:
     size = scan.largest_image
     offered = f'recorded as {reliability}' if reliability else 'reliability not recorded'
     return by_case(
-        'live transport',
+        Code.LIVE_TRANSPORT,
         f'{topic.name} {offered}, up to {size / 1e3:.0f} kB per image',
         {'largest_bytes': size, 'reliability': reliability or None},
         Case(
@@ -421,26 +472,26 @@ _PLAUSIBLE_FORCE = (9.4, 10.8)
 _FASTEST_MEDIAN = 8.0
 
 
-def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
+def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Line]:
     """Findings on the IMU by itself."""
     if not len(scan.rates):
         problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
         return [
-            Finding(
-                'gyro',
+            property_line(
+                Code.GYRO,
                 WRONG,
                 f'no gyro: {problem}',
                 'choose a topic that has angular_velocity with --imu-topic',
-                measured={},
+                {},
             )
         ]
     stamps, gap = scan.stamps(Role.IMU), parameters.imu.max_imu_gap
-    rate = _no_step('imu rate', stamps, {})
+    rate = _no_step(Code.IMU_RATE, stamps, {})
     if stamps.interval > 0.0:
         gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
         hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
         rate = by_case(
-            'imu rate',
+            Code.IMU_RATE,
             f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
             f'{1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability),
             {
@@ -478,18 +529,18 @@ def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
         )
     return [
         rate,
-        stamp_finding('imu stamps', stamps, 'the IMU'),
+        stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU'),
         _gyro(scan),
         _bias(scan, parameters),
         _accelerometer(scan),
     ]
 
 
-def _gyro(scan: Scan) -> Finding:
+def _gyro(scan: Scan) -> Line:
     rates = np.linalg.norm(scan.rates, axis=1)
     median, high = float(np.median(rates)), float(np.percentile(rates, 95))
     return by_case(
-        'gyro',
+        Code.GYRO,
         f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
         {'median_rad_s': median, 'p95_rad_s': high},
         Case(
@@ -507,16 +558,16 @@ def _gyro(scan: Scan) -> Finding:
     )
 
 
-def _bias(scan: Scan, parameters: Parameters) -> Finding:
+def _bias(scan: Scan, parameters: Parameters) -> Line:
     configured, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
-    name, rest = 'gyro at rest', scan.rest
+    name, rest = Code.GYRO_AT_REST, scan.rest
     if rest is None:
-        return Finding(
+        return property_line(
             name,
             UNKNOWN,
             'not measured: the IMU is never at rest here',
             'to measure it, keep the camera at rest for some seconds',
-            measured={'at_rest_rad_s': None},
+            {'at_rest_rad_s': None},
         )
     listed = [round(float(value), 5) for value in rest.value]
     off = float(np.abs(rest.value - np.array(configured)).max())
@@ -534,8 +585,8 @@ def _bias(scan: Scan, parameters: Parameters) -> Finding:
     )
 
 
-def _accelerometer(scan: Scan) -> Finding:
-    name, forces = 'gravity', scan.forces
+def _accelerometer(scan: Scan) -> Line:
+    name, forces = Code.GRAVITY, scan.forces
     if not len(forces):
         return by_case(
             name,
@@ -551,7 +602,7 @@ def _accelerometer(scan: Scan) -> Finding:
         )
     length = float(np.linalg.norm(forces, axis=1).mean())
     fault = length_fault(length)
-    text = fault.partition(': ')[0] or f'|acc| {length:.2f} m/s^2 in the mean'
+    text = fault.message if fault else f'|acc| {length:.2f} m/s^2 in the mean'
     if scan.orientations:
         text += f', and {scan.orientations} orientations with covariance'
     return by_case(
@@ -562,7 +613,7 @@ def _accelerometer(scan: Scan) -> Finding:
             'mean_m_s2': forces.mean(axis=0).tolist(),
             'orientations': scan.orientations,
         },
-        Case(bool(fault), WRONG, f'{fault.partition(": ")[2]}; or set use_gravity: false'),
+        Case(bool(fault), WRONG, f'{ForceFault.fix}; or set use_gravity: false'),
         Case(
             not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1],
             SUSPECT,
@@ -586,14 +637,14 @@ _NO_EFFECT, _STRONG_EFFECT = 1.0, 4.0
 # times the largest sigma of an observable one it may reach before poses are wrong.
 _CERTAIN, _GROSS = 4.0, 3.0
 _MEASURE = 'measure it with "rs_relpose calibrate"'
-_READOUT = frozenset(('readout_time', 'readout_direction'))
+_READOUT = frozenset((Code.READOUT_TIME, Code.READOUT_DIRECTION))
 # Quantities by the parameters that set them.
-_SET_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
+_SET_BY = {'quat_cam_imu_xyzw': Code.AXES, 'readout_time': Code.READOUT_TIME}
 
 
 def joint_findings(
     scan: Scan, sample: Sample | None, completion: Completion, parameters: Parameters
-) -> list[Finding]:
+) -> list[Line]:
     """Findings on both sensors together.
 
     `sample` is None if `completion` could not find missing `parameters`.
@@ -604,21 +655,17 @@ def joint_findings(
         found += [_pairs(sample, health), _texture(sample, health)]
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
-    found += [_not_configured(name, completion, scan) for name in sorted(missing)]
-    found += [
-        finding for finding in quantity_findings(health, reason) if finding.quantity not in missing
-    ]
+    found += [_not_configured(code, completion, scan) for code in sorted(missing)]
+    found += [line for line in quantity_findings(health, reason) if line.code not in missing]
     effect = _effect(scan, health, completion.parameters)
     return found if effect is None else [*found, effect]
 
 
-def _overlap(scan: Scan, parameters: Parameters) -> Finding:
+def _overlap(scan: Scan, parameters: Parameters) -> Line:
     """Whether the gyro covers the images in time, as stamped."""
-    name, images, imu = 'clocks', scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
+    name, images, imu = Code.CLOCKS, scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
     if not images.count or not imu.count:
-        return Finding(
-            name, WRONG, 'no stamps to compare', 'correct the topics above', measured={}
-        )
+        return property_line(name, WRONG, 'no stamps to compare', 'correct the topics above', {})
     image_ns, imu_ns = images.ns + round(parameters.sensor.time_offset * 1e9), imu.ns
     common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
     apart = images.delay - imu.delay
@@ -626,13 +673,13 @@ def _overlap(scan: Scan, parameters: Parameters) -> Finding:
     if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
         _SAME_CLOCK, 0.5 * images.duration
     ):
-        return Finding(
+        return property_line(
             name,
             WRONG,
             f'images and IMU are stamped {abs(apart):.3f} s apart',
             'use one clock for both drivers (ROS time, not time since boot), or set '
             f'time_offset: {apart:.3f} if the difference is constant',
-            measured=measured,
+            measured,
         )
     return by_case(
         name,
@@ -652,11 +699,11 @@ def _overlap(scan: Scan, parameters: Parameters) -> Finding:
     )
 
 
-def _pairs(sample: Sample, health: Assessment) -> Finding:
+def _pairs(sample: Sample, health: Assessment) -> Line:
     pairs, posed = len(sample.matches), sample.poses
     reason = next(iter(sample.reasons.most_common()), 'too few images were processed')
     return by_case(
-        'pairs',
+        Code.PAIRS,
         f'{pairs} pairs in {sample.frames} images, {posed} with a pose',
         {'images': sample.frames, 'pairs': pairs, 'poses': posed},
         Case(
@@ -682,14 +729,16 @@ def _pairs(sample: Sample, health: Assessment) -> Finding:
     )
 
 
-def _texture(sample: Sample, health: Assessment) -> Finding:
+def _texture(sample: Sample, health: Assessment) -> Line:
     if not sample.matches:
-        return Finding('texture', UNKNOWN, 'not measured: there is no pair of images', measured={})
+        return property_line(
+            Code.TEXTURE, UNKNOWN, 'not measured: there is no pair of images', '', {}
+        )
     median = float(np.median(sample.matches))
     poor = float(np.mean(np.array(sample.matches) < _FEW_MATCHES))
     few = median < _NO_MATCHES or poor > 0.3
     return by_case(
-        'texture',
+        Code.TEXTURE,
         f'{median:.0f} matches per pair in the median',
         {'median_matches': median, 'poor_share': poor},
         Case(
@@ -716,7 +765,7 @@ def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Ass
     found, health = completion.found, sample.health
     # No calibration finds another unit, nor axes that no rotation corrects.
     beyond = any(
-        fault.quantity == 'gyro_unit' or (fault.quantity == 'axes' and fault.estimated is None)
+        fault.code is Code.GYRO_UNIT or (fault.code is Code.AXES and not fault.estimated)
         for fault in health.faults
     )
     if found is None or scan.intrinsics is None or beyond or not sample.is_lost:
@@ -728,58 +777,46 @@ def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Ass
     )
     if not wrong:
         return health
-    named = {finding.quantity for finding in wrong}
+    named = {finding.code for finding in wrong}
     if not named.isdisjoint(_READOUT):
         named |= _READOUT
-    unknown = {one.quantity: one for one in not_evaluated(named, wrong[0].quantity)}
+    unknown = {one.code: one for one in not_evaluated(named, wrong[0].code)}
     return Assessment(
         (
             *wrong,
-            *(
-                unknown.get(one.quantity, one)
-                for one in health.findings
-                if one.quantity not in named
-            ),
+            *(unknown.get(one.code, one) for one in health.findings if one.code not in named),
         )
     )
 
 
-def quantity_findings(health: Assessment, reason: str) -> Iterator[Finding]:
+def quantity_findings(health: Assessment, reason: str) -> Iterator[Line]:
     """Findings on the quantities, by the sample; `reason`: why there are none."""
     for finding in health.findings:
+        message, fix = text_of(finding)
         state = _state(finding)
-        yield replace(
-            finding,
-            state=state,
-            fix='; '.join(
-                filter(
-                    None,
-                    (
-                        finding.fix,
-                        _MEASURE
-                        if state is not finding.state is OK
-                        else 'check again afterwards: a large deviation hides others'
-                        if state is WRONG
-                        else '',
-                    ),
-                )
-            ),
-        )
+        further = ''
+        if state is not finding.state is OK:
+            further = _MEASURE
+        elif state is WRONG:
+            further = 'check again afterwards: a large deviation hides others'
+        why = Why.OFF if state is not finding.state is OK else finding.why
+        fixes = '; '.join(filter(None, (fix, further)))
+        yield Line(replace(finding, state=state, why=why), message, fixes)
     if not health.findings:
-        for quantity in BY_NAME.values():
-            yield Finding(quantity.name, UNKNOWN, f'not measured: {reason}', unit=quantity.unit)
+        for quantity in QUANTITIES:
+            yield Line(quantity.unknown(Why.NOT_MEASURED), f'not measured: {reason}')
 
 
 def _state(finding: Finding) -> FindingState:
     """State of a parameter by itself: a certain deviation counts even if no pose suffers."""
     if (
-        finding.configured is None
-        or finding.estimated is None
+        finding.told is None
+        or finding.seen is None
         or finding.sigma is None
-        or abs(finding.estimated - finding.configured) < _CERTAIN * finding.sigma
+        or abs(finding.seen - finding.told) < _CERTAIN * finding.sigma
     ):
         return finding.state
-    quantity = BY_NAME.get('readout_time' if finding.quantity in _READOUT else finding.quantity)
+    quantity = BY_CODE.get(Code.READOUT_TIME if finding.code in _READOUT else finding.code)
     if finding.state is WRONG or (
         quantity is not None and quantity.deviation(finding) > _GROSS * quantity.observable
     ):
@@ -787,34 +824,25 @@ def _state(finding: Finding) -> FindingState:
     return SUSPECT
 
 
-def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
+def _not_configured(code: Code, completion: Completion, scan: Scan) -> Line:
     """A parameter that is not configured, by the calibration."""
-    found, quantity = completion.found, BY_NAME[name]
-    unknown = Finding(
-        name,
-        UNKNOWN,
-        f'not configured, and not estimated: {completion.problem}',
-        _MEASURE,
-        unit=quantity.unit,
-    )
+    found = completion.found
+    unknown = BY_CODE[code].unknown(Why.NOT_MEASURED)
     if found is None:
-        return unknown
-    estimate = found.rotation if name == 'axes' else found.readout_time
+        message = f'not configured, and not estimated: {completion.problem}'
+        return Line(unknown, message, _MEASURE)
+    estimate = found.rotation if code is Code.AXES else found.readout_time
     if not estimate.observable:
-        return replace(unknown, message=f'not configured, and not observable: {estimate.remark}')
-    if name == 'readout_time':
+        message = f'not configured, and not observable: {estimate.remark}'
+        return Line(unknown, message, _MEASURE)
+    if code is Code.READOUT_TIME:
         size = abs(estimate.value)
-        return replace(
-            unknown,
-            message=(
-                f'not configured; estimated {quantity.with_sigma(size, estimate.sigma)}'
-                + (', the last row first' if estimate.value < 0.0 else '')
-            ),
-            estimated=size,
-            sigma=estimate.sigma,
-            observable=True,
-        )
-    text = (
+        message = f'not configured; estimated {with_sigma(code, size, estimate.sigma)}'
+        if estimate.value < 0.0:
+            message += ', the last row first'
+        measured = replace(unknown, estimated=(size,), sigma=estimate.sigma)
+        return Line(measured, message, _MEASURE)
+    message = (
         f'quat_cam_imu_xyzw not configured; nearest map {axes_text(found.axis_map)}, '
         f'{math.degrees(found.rotation.value):.1f} deg from it'
     )
@@ -822,20 +850,20 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
         down = -found.R_cam_imu @ scan.forces.mean(axis=0)
         axis = int(np.argmax(np.abs(down)))
         sides = (('left', 'right'), ('top', 'bottom'), ('back', 'front'))[axis]
-        text += f'; gravity points to the {sides[int(down[axis] > 0.0)]} of the image'
-    return replace(unknown, message=text)
+        message += f'; gravity points to the {sides[int(down[axis] > 0.0)]} of the image'
+    return Line(unknown, message, _MEASURE)
 
 
-def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding | None:
+def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Line | None:
     """Displacement of the last row relative to the first by rotation alone [px]."""
-    name, intrinsics, rest = 'rolling shutter', scan.intrinsics, scan.rest
+    name, intrinsics, rest = Code.ROLLING_SHUTTER, scan.intrinsics, scan.rest
     if intrinsics is None or not len(scan.rates):
         return None
     configured = parameters.sensor.readout_time
-    found = {finding.quantity: finding for finding in health.findings}.get('readout_time')
+    found = {finding.code: finding for finding in health.findings}.get(Code.READOUT_TIME)
     readout, source, state = configured, '', OK
-    if found is not None and found.estimated is not None and _state(found) in (SUSPECT, WRONG):
-        readout, source = found.estimated, ' as estimated'
+    if found is not None and found.seen is not None and _state(found) in (SUSPECT, WRONG):
+        readout, source = found.seen, ' as estimated'
     elif configured is None:
         readout, source, state = _EXAMPLE_READOUT, ' (assumed; set readout_time)', UNKNOWN
     elif configured == 0.0:

@@ -7,7 +7,7 @@ parameters that are missing, and replaces those that are too far off for the fro
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 import math
@@ -30,7 +30,14 @@ from rs_relpose_ros.imu.filters import GyroBias
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
 from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    BY_CODE,
+    Code,
+    Finding,
+    FindingState,
+    Why,
+)
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import warm_up
@@ -161,7 +168,7 @@ _FEW_USED = 0.1
 # Share of the pairs that have a pose if the camera moves and is correctly configured.
 _MOST_POSED = 0.7
 # Quantities whose large deviations are detected, but not measured.
-_FAR_OFF = frozenset(('axes', 'time_offset', 'image_geometry'))
+_FAR_OFF = frozenset((Code.AXES, Code.TIME_OFFSET, Code.IMAGE_GEOMETRY))
 # Largest number of images that wait for the gyro: if the clocks differ it never comes.
 _MOST_WAITING = 64
 # Sigmas beyond which a calibration contradicts the configuration, and least differences [rad, s].
@@ -244,14 +251,13 @@ def contradicted(
     signed = camera.line_delay * camera.height
     axes_sigma = float(found.rotation_sigma.max())
     offset_sigma = math.hypot(found.time_offset.sigma, share * readout.sigma)
-    by_readout = _contradiction('readout_time', abs(signed), abs(readout.value), readout.sigma)
+    by_readout = _contradiction(Code.READOUT_TIME, abs(signed), abs(readout.value), readout.sigma)
     if np.sign(readout.value) * np.sign(signed) < 0.0:
         by_readout = replace(
             by_readout,
-            quantity='readout_direction',
-            estimated=-abs(readout.value),
-            message=f'{by_readout.message}, in the opposite direction',
-            fix=f'set readout_direction: {"up" if readout.value < 0.0 else "down"}',
+            code=Code.READOUT_DIRECTION,
+            estimated=(-abs(readout.value),),
+            settings={'readout_direction': 'up' if readout.value < 0.0 else 'down'},
         )
     return tuple(
         finding
@@ -261,11 +267,11 @@ def contradicted(
                 axes_sigma,
                 _LEAST_ANGLE,
                 _contradiction(
-                    'axes',
+                    Code.AXES,
                     0.0,
                     math.degrees(angle),
                     math.degrees(axes_sigma),
-                    findings.rounded(found.quat_cam_imu_xyzw),
+                    {'quat_cam_imu_xyzw': findings.rounded(found.quat_cam_imu_xyzw)},
                 ),
             ),
             (
@@ -273,7 +279,7 @@ def contradicted(
                 offset_sigma,
                 _LEAST_TIME,
                 _contradiction(
-                    'time_offset', sensor.time_offset, sensor.time_offset + off, offset_sigma
+                    Code.TIME_OFFSET, sensor.time_offset, sensor.time_offset + off, offset_sigma
                 ),
             ),
             (readout.value - signed, readout.sigma, _LEAST_TIME, by_readout),
@@ -283,19 +289,22 @@ def contradicted(
 
 
 def _contradiction(
-    name: str, configured: float, estimated: float, sigma: float, setting: object = None
+    code: Code,
+    configured: float,
+    estimated: float,
+    sigma: float,
+    settings: Mapping[str, Any] | None = None,
 ) -> Finding:
-    quantity = BY_NAME[name]
+    """A parameter that a calibration contradicts; `settings`: None for the estimate itself."""
     return Finding(
-        name,
+        code,
         FindingState.WRONG,
-        'by a calibration: ' + quantity.compared(estimated, sigma, configured),
-        quantity.fix.format(estimated if setting is None else setting),
-        configured,
-        estimated,
+        Why.BY_CALIBRATION,
+        (configured,),
+        (estimated,),
         sigma,
-        quantity.unit,
-        True,
+        BY_CODE[code].unit,
+        settings={code.value: estimated} if settings is None else settings,
     )
 
 
@@ -318,8 +327,7 @@ class Sample(NamedTuple):
     def is_lost(self) -> bool:
         """Whether a deviation may be too large to be estimated from pairs."""
         return bool(self.matches) and (
-            self.few_poses
-            or not _FAR_OFF.isdisjoint(fault.quantity for fault in self.health.faults)
+            self.few_poses or not _FAR_OFF.isdisjoint(fault.code for fault in self.health.faults)
         )
 
 

@@ -31,6 +31,7 @@ from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
 from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED, worst_of
+from rs_relpose_ros.pipeline.findings_text import summary_json
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused
@@ -262,7 +263,7 @@ def _summary(
             'clock_jumps': sequencer.clock_jumps,
         },
         'tracked': _tracked(last),
-        'health': health.as_json(),
+        'health': summary_json(health),
         'invalid_messages': run.invalid_messages,
         'not_used': run.reasons.most_common(),
         'medians': {

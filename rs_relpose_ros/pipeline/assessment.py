@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,14 @@ from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import Finding, FindingState, Quantity
+from rs_relpose_ros.pipeline.findings import (
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Quantity,
+    Why,
+)
 from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_SIGMA
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
@@ -305,180 +312,159 @@ def assess(
     if gross:
         # Poses of wrong axes or units do not determine the other quantities.
         return findings.Assessment(
-            gross + not_evaluated({finding.quantity for finding in gross}, gross[0].quantity)
+            gross + not_evaluated({finding.code for finding in gross}, gross[0].code)
         )
     largest = max((one.shift for one in inconsistent), default=0.0)
     faults = {
-        one.quantity.name: one
+        one.quantity.code: one
         for one in inconsistent
         if one.shift > max(_MATTERS, _TRACE * largest)
         and (np.abs(one.deviation) > (_AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()
     }
     others = {
-        one.alternative.quantity.name: one.alternative
+        one.alternative.quantity.code: one.alternative
         for one in faults.values()
         if one.alternative is not None
     }
     faults |= others
-    alternatives = ' or '.join(faults) if others else ''
+    candidates = tuple(faults) if others else ()
     found: list[Finding] = []
     for quantity in findings.QUANTITIES:
         part = quantity.part
-        if quantity.name in faults:
-            found += _fault_findings(faults[quantity.name], configured, alternatives)
+        if quantity.code in faults:
+            found += _fault_findings(faults[quantity.code], estimated, configured, candidates)
         elif float(estimated.sigma[part].max()) > quantity.observable:
-            found.append(quantity.unknown('not observable in this motion, or too few pairs'))
+            found.append(quantity.unknown(Why.NOT_OBSERVABLE))
         elif faults:
-            found.append(quantity.unknown('not evaluated while another parameter is inconsistent'))
+            found.append(quantity.unknown(Why.OTHER_INCONSISTENT, next(iter(faults))))
         else:
-            found.append(
-                _values(
-                    quantity,
-                    (estimated.c - configured.active)[part],
-                    estimated.sigma[part],
-                    configured,
-                )[0]
-            )
+            left = (estimated.c - configured.active)[part]
+            found.append(_values(quantity, left, estimated.sigma[part], configured, estimated))
     return findings.Assessment(tuple(found))
 
 
-def not_evaluated(named: set[str], wrong: str) -> tuple[Finding, ...]:
+def not_evaluated(named: set[Code], wrong: Code) -> tuple[Finding, ...]:
     """Findings on the quantities that are not `named`, while another one is `wrong`."""
     return tuple(
-        quantity.unknown(f'not evaluated while {wrong} is wrong')
+        quantity.unknown(Why.OTHER_WRONG, wrong)
         for quantity in findings.QUANTITIES
-        if quantity.name not in named
+        if quantity.code not in named
     )
 
 
 def _fault_findings(
-    one: Inconsistency, configured: Configured, alternatives: str
+    one: Inconsistency,
+    estimated: Calibration,
+    configured: Configured,
+    candidates: tuple[Code, ...],
 ) -> Iterator[Finding]:
-    """Findings on an inconsistent quantity; `alternatives`: hypotheses that fit as well."""
+    """Findings on an inconsistent quantity; `candidates`: all hypotheses that fit as well."""
     quantity = one.quantity
     sure = one.claimed_shift * (1.0 - 2.0 / one.certainty)
     state = FindingState.WRONG if sure > _OUTSIDE else FindingState.SUSPECT
-    consistent, setting = _values(
-        quantity,
-        one.deviation[quantity.part],
-        np.hypot(one.sigma[quantity.part], _SELECTED * np.linalg.norm(one.deviation)),
-        configured,
-    )
-    estimated = consistent.estimated
-    assert estimated is not None and consistent.sigma is not None
-    found = replace(consistent, state=state)
-    if quantity.name == 'readout_time' and estimated < 0.0:
+    left = one.deviation[quantity.part]
+    sigmas = np.hypot(one.sigma[quantity.part], _SELECTED * np.linalg.norm(one.deviation))
+    consistent = _values(quantity, left, sigmas, configured, estimated)
+    evidence = replace(consistent.evidence, sigmas=one.certainty, shift=one.shift)
+    found = replace(consistent, state=state, why=Why.OFF, evidence=evidence, candidates=candidates)
+    assert found.seen is not None
+    if quantity.code is Code.READOUT_TIME and found.seen < 0.0:
         other = 'up' if configured.sensor.readout_direction == 'down' else 'down'
-        yield replace(
-            found,
-            quantity='readout_direction',
-            fix=f'set readout_direction: {other}',
-            message='rows are read in the opposite direction, in '
-            + quantity.with_sigma(-estimated, consistent.sigma),
-        )
+        yield replace(found, code=Code.READOUT_DIRECTION, settings={'readout_direction': other})
         return
-    fix = quantity.fix.format(setting)
-    # Tracking, if it is off, starts from the parameter.
+    settings = _setting(found, left, configured) | _tracking(quantity, found.seen, configured)
+    if quantity.code is Code.TIME_OFFSET:
+        settings |= _equivalent_row(one, configured)
+    yield replace(found, settings=settings)
     if (
-        quantity.tracking
-        and not getattr(configured.sensor, quantity.tracking)
-        and (abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach)
+        quantity.code is Code.DISTORTION
+        and found.told
+        and abs(found.seen) < _LITTLE_OF * abs(found.told)
     ):
-        fix += f', or {quantity.tracking}: true'
-    if quantity.name == 'time_offset':  # another stamped row may be equivalent
-        camera, sigma = configured.camera, one.sigma[findings.OFFSET]
-        rows = [
-            row
-            for row in REFERENCE_ROWS
-            if row != camera.reference_row
-            and abs(
-                one.deviation[findings.OFFSET]
-                - camera.line_delay
-                * (
-                    camera.reference_row_index
-                    - replace(camera, reference_row=row).reference_row_index
-                )
-            )
-            < 2.0 * sigma
-        ]
-        fix += f' (stamp_row: {rows[0]} is equivalent)' if rows else ''
-    if alternatives:
-        fix += f' (ambiguous: {alternatives})'
-    yield replace(
-        found, fix=fix, message=f'{found.message} (shifts the pose by {one.shift:.1f} sigmas)'
-    )
-    if (
-        quantity.name == 'distortion'
-        and found.configured
-        and (abs(estimated) < _LITTLE_OF * abs(found.configured))
-    ):
-        yield _fault(
-            'image_geometry',
-            'hardly any distortion left in the images: they may be rectified',
-            'subscribe to the original images',
-            state,
-        )
+        yield Finding(Code.IMAGE_GEOMETRY, state, Why.RECTIFIED, parent=Code.DISTORTION)
 
 
-def _fault(
-    quantity: str,
-    message: str,
-    fix: str,
-    state: FindingState = FindingState.WRONG,
-    configured: float | None = None,
-    estimated: float | None = None,
-    unit: str = '',
-) -> Finding:
-    return Finding(quantity, state, message, fix, configured, estimated, None, unit, True)
+def _setting(found: Finding, left: Array, configured: Configured) -> dict[str, Any]:
+    """The parameter that removes a deviation `left`, with its value; empty if there is none."""
+    if found.code is Code.AXES:
+        R_cam_imu = exp_so3(left) @ configured.sensor.R_cam_imu
+        quat_xyzw = Rotation.from_matrix(R_cam_imu).as_quat()
+        return {'quat_cam_imu_xyzw': findings.rounded(quat_xyzw)}
+    if found.code is Code.GYRO_BIAS:
+        return {'gyro_bias': findings.rounded(found.estimated)}
+    if found.code in (Code.TIME_OFFSET, Code.READOUT_TIME):
+        return {found.code.value: found.seen}
+    return {}
+
+
+def _tracking(quantity: Quantity, estimated: float, configured: Configured) -> dict[str, Any]:
+    """The parameter that has a quantity tracked, if that is off and reaches the estimate."""
+    sensor = configured.sensor
+    if not quantity.tracking or getattr(sensor, quantity.tracking):
+        return {}
+    # Tracking starts from the parameter.
+    start = getattr(sensor, quantity.code.value) or 0.0
+    return {quantity.tracking: True} if abs(estimated - start) < quantity.reach else {}
+
+
+def _equivalent_row(one: Inconsistency, configured: Configured) -> dict[str, Any]:
+    """Another stamped row that is equivalent to the deviation of the time offset."""
+    camera, sigma = configured.camera, one.sigma[findings.OFFSET]
+    for row in REFERENCE_ROWS:
+        index = replace(camera, reference_row=row).reference_row_index
+        offset = camera.line_delay * (camera.reference_row_index - index)
+        if row != camera.reference_row and (
+            abs(one.deviation[findings.OFFSET] - offset) < 2.0 * sigma
+        ):
+            return {'stamp_row': row}
+    return {}
 
 
 def _values(
-    quantity: Quantity, left: Array, sigmas: Array, configured: Configured
-) -> tuple[Finding, object]:
-    """A consistent finding with the values of a quantity, and the value to set.
+    quantity: Quantity,
+    left: Array,
+    sigmas: Array,
+    configured: Configured,
+    calibration: Calibration,
+) -> Finding:
+    """A consistent finding with the values of a quantity.
 
     `left`: deviation from the active values; of a vector, the most certain component is reported.
     """
     camera, sensor = configured.camera, configured.sensor
     worst = int(np.argmax(np.abs(left) / sigmas))
-    sigma, setting = float(sigmas[worst]), None
-    values: dict[str, ArrayLike] = {  # active ones, in the unit of the quantity
-        'axes': 0.0,
-        'time_offset': sensor.time_offset + float(configured.active[findings.OFFSET]),
-        'readout_time': camera.readout_time,
-        'gyro_bias': configured.gyro_bias + configured.active[findings.BIAS],
-        'gyro_scale': 1.0,
-        'focal_length': camera.fx,
-        'distortion': (*camera.distortion, 0.0)[0],
+    sigma = float(sigmas[worst])
+    evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=len(calibration.b))
+    values: dict[Code, ArrayLike] = {  # active ones, in the unit of the quantity
+        Code.AXES: 0.0,
+        Code.TIME_OFFSET: sensor.time_offset + float(configured.active[findings.OFFSET]),
+        Code.READOUT_TIME: camera.readout_time,
+        Code.GYRO_BIAS: configured.gyro_bias + configured.active[findings.BIAS],
+        Code.GYRO_SCALE: 1.0,
+        Code.FOCAL_LENGTH: camera.fx,
+        Code.DISTORTION: (*camera.distortion, 0.0)[0],
     }
-    active = np.atleast_1d(np.asarray(values[quantity.name], dtype=np.float64))
+    active = np.atleast_1d(np.asarray(values[quantity.code], dtype=np.float64))
     estimated = active + left
-    if quantity.name == 'axes':
+    if quantity.code is Code.AXES:
         estimated = np.degrees([float(np.linalg.norm(left))])
         sigma *= math.degrees(1.0)
-        setting = findings.rounded(
-            Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat()
-        )
-    elif quantity.name == 'readout_time':  # the deviation is that of the signed one
+    elif quantity.code is Code.READOUT_TIME:  # the deviation is that of the signed one
         estimated = active + configured.direction * left
-    elif quantity.name == 'gyro_bias':
-        setting = findings.rounded(estimated)
-    elif quantity.name == 'focal_length':  # the deviation is that of its inverse
+    elif quantity.code is Code.FOCAL_LENGTH:  # the deviation is that of its inverse
         estimated = active / (1.0 + left)
         sigma *= float(estimated[0])
-    component = worst if len(active) > 1 else 0
-    value = float(estimated[component])
     return Finding(
-        quantity.name,
+        quantity.code,
         FindingState.OK,
-        quantity.compared(estimated, sigma, active),
-        '',
-        float(active[component]),
-        value,
+        Why.CONSISTENT,
+        tuple(active.tolist()),
+        tuple(estimated.tolist()),
         sigma,
         quantity.unit,
-        True,
-    ), value if setting is None else setting
+        component=worst if len(active) > 1 else 0,
+        evidence=evidence,
+    )
 
 
 def gross_errors(
@@ -494,23 +480,20 @@ def gross_errors(
         1.0 < rotations.scale * _UNIT_FACTOR < _UNIT_FACTOR**2
     ):
         return tuple(_rotation_errors(rotations, configured))
-    if apart := clocks_apart(ahead):
+    if clocks_apart(ahead):
         return (
-            _fault(
-                'time_offset',
-                apart,
-                'stamp both by one clock, or set time_offset: '
-                f'{configured.sensor.time_offset + ahead:.2f} if they differ by a constant',
+            Finding(
+                Code.TIME_OFFSET,
+                FindingState.WRONG,
+                Why.CLOCKS_APART,
+                evidence=Evidence(measured={'ahead_s': ahead}),
+                settings={'time_offset': configured.sensor.time_offset + ahead},
             ),
         )
     found = tuple(_rotation_errors(rotations, configured))
     # Any error may leave images and gyro independent for a while, if frames are lost.
-    certain = found and (not before or found[0].quantity != _INDEPENDENT_OF[0])
+    certain = found and (not before or found[0].why is not Why.INDEPENDENT)
     return found if certain else before
-
-
-# Quantities that are wrong if images and gyro rotate independently.
-_INDEPENDENT_OF = 'image_geometry', 'time_offset'
 
 
 def _rotation_errors(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:
@@ -518,12 +501,8 @@ def _rotation_errors(rotations: RotationComparison, configured: Configured) -> I
     explained = min(rotations.left_at_best, rotations.left_mirrored)
     if explained < _EXPLAINED_AT_BEST:
         if rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR:
-            yield _fault(
-                'gyro_unit',
-                f'images rotate {rotations.scale:.3g} times as far as the gyro',
-                'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
-                configured=1.0,
-                estimated=rotations.scale,
+            yield Finding(
+                Code.GYRO_UNIT, FindingState.WRONG, Why.GROSS, (1.0,), (rotations.scale,)
             )
         if rotations.is_left_handed or rotations.is_turned:
             yield from _wrong_axes(rotations, configured)
@@ -531,14 +510,9 @@ def _rotation_errors(rotations: RotationComparison, configured: Configured) -> I
         rotations.by_gyro > _LONG_ROTATION and min(explained, rotations.left_of_all) > _INDEPENDENT
     ):
         # Of a constant rate only noise is left once it is removed.
-        for name in _INDEPENDENT_OF:
-            yield _fault(
-                name,
-                'images and gyro rotate independently of each other',
-                'verify that '
-                'the IMU is that of this camera, that both stamp by one clock, and that '
-                'electronic stabilisation is off',
-            )
+        candidates = Code.IMAGE_GEOMETRY, Code.TIME_OFFSET
+        for code in candidates:
+            yield Finding(code, FindingState.WRONG, Why.INDEPENDENT, candidates=candidates)
 
 
 def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:
@@ -547,41 +521,35 @@ def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterat
         # Usually a single sign in the axes of the IMU itself.
         signs = np.diag(R_cam_imu.T @ rotations.reflection @ R_cam_imu)
         axis = 'xyz'[int(np.argmin(signs))] if sorted(signs)[1] > 0.7 > -0.7 > min(signs) else ''
-        yield _fault(
-            'axes',
-            'the axes of the gyro are left-handed: '
-            + (f'wrong sign of {axis}' if axis else 'wrong sign of one or of all axes'),
-            'correct the driver (no quat_cam_imu_xyzw corrects a sign)',
-        )
+        evidence = Evidence(measured={'axis': axis})
+        yield Finding(Code.AXES, FindingState.WRONG, Why.LEFT_HANDED, evidence=evidence)
         return
-    angle, Q = rotations.angle, rotations.rotation
-    xyzw = findings.rounded(Rotation.from_matrix(Q @ R_cam_imu).as_quat(), 3)
-    yield _fault(
-        'axes',
-        f'rotation axes of the images are {math.degrees(angle):.0f} deg from '
-        f'those of the gyro by quat_cam_imu_xyzw; about {xyzw} fits',
-        'refine it with '
-        '"rs_relpose calibrate" (a static transform with parent imu holds the inverse)',
-        configured=0.0,
-        estimated=math.degrees(angle),
+    images = _how_images_are_turned(rotations)
+    candidates = (Code.AXES, Code.IMAGE_GEOMETRY) if images else ()
+    xyzw = Rotation.from_matrix(rotations.rotation @ R_cam_imu).as_quat()
+    yield Finding(
+        Code.AXES,
+        FindingState.WRONG,
+        Why.GROSS,
+        (0.0,),
+        (math.degrees(rotations.angle),),
         unit='deg',
+        candidates=candidates,
+        settings={'quat_cam_imu_xyzw': findings.rounded(xyzw, 3)},
     )
+    for why in images:
+        yield Finding(Code.IMAGE_GEOMETRY, FindingState.WRONG, why, candidates=candidates)
+
+
+def _how_images_are_turned(rotations: RotationComparison) -> list[Why]:
+    """What turned images would explain a rotation of the axes; empty if none would."""
+    angle, Q = rotations.angle, rotations.rotation
+    found = []
     about_view = float(log_so3(Q)[2])
     if abs(abs(about_view) - 0.5 * math.pi) < _QUARTER_TURN > angle - abs(about_view):
-        yield _fault(
-            'image_geometry',
-            'alternatively, the images are rotated by 90 deg '
-            + ('clockwise' if about_view > 0.0 else 'counterclockwise'),
-            'publish them '
-            'as the sensor provides them, with its CameraInfo: no other has rows that '
-            'are read one by one',
-        )
+        found.append(Why.CLOCKWISE if about_view > 0.0 else Why.COUNTERCLOCKWISE)
     if abs(angle - math.pi) < _HALF_TURN:
         axis_of = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
         if float(axis_of.max()) > math.cos(_HALF_TURN):
-            flip = 'upside down' if axis_of[2] == axis_of.max() else 'mirrored'
-            yield _fault(
-                'image_geometry',
-                f'alternatively, the images are {flip}',
-                'publish them as the sensor provides them',
-            )
+            found.append(Why.UPSIDE_DOWN if axis_of[2] == axis_of.max() else Why.MIRRORED)
+    return found

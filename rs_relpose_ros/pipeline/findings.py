@@ -1,4 +1,6 @@
-"""Findings of the consistency monitor and of `check`, and the table of the quantities they cover.
+"""Findings of the consistency monitor and of `check` as objects, and the quantities they cover.
+
+A finding has codes and numbers; `findings_text` makes its text where it leaves the process.
 
 The vector ``c`` (11,) of small deviations, true minus configured, has these parts:
 
@@ -13,7 +15,7 @@ The vector ``c`` (11,) of small deviations, true minus configured, has these par
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 import math
 from typing import Any, NamedTuple
@@ -48,54 +50,125 @@ class FindingState(str, Enum):
         return {'suspect': 'warning', 'wrong': 'failure'}.get(self.value, self.value)
 
 
+class Code(str, Enum):
+    """What a finding is about; the value is its name in messages, JSON and logs."""
+
+    # Parameters that images and gyro determine: `QUANTITIES`.
+    AXES = 'axes'
+    TIME_OFFSET = 'time_offset'
+    READOUT_TIME = 'readout_time'
+    GYRO_BIAS = 'gyro_bias'
+    GYRO_SCALE = 'gyro_scale'
+    FOCAL_LENGTH = 'focal_length'
+    DISTORTION = 'distortion'
+    # Further causes that the consistency monitor names.
+    READOUT_DIRECTION = 'readout_direction'
+    GYRO_UNIT = 'gyro_unit'
+    IMAGE_GEOMETRY = 'image_geometry'
+    ACCEL_AXES = 'accel_axes'
+    ACCEL_SCALE = 'accel_scale'
+    # Properties of a recording: `is_property`.
+    TOPICS = 'topics'
+    PARAMETERS = 'parameters'
+    TRANSFORMS = 'transforms'
+    IMAGES = 'images'
+    TRANSPORT = 'transport'
+    IMAGE_RATE = 'image rate'
+    IMAGE_STAMPS = 'image stamps'
+    CALIBRATION = 'calibration'
+    LIVE_TRANSPORT = 'live transport'
+    IMU_RATE = 'imu rate'
+    IMU_STAMPS = 'imu stamps'
+    GYRO = 'gyro'
+    GYRO_AT_REST = 'gyro at rest'
+    GRAVITY = 'gravity'
+    CLOCKS = 'clocks'
+    PAIRS = 'pairs'
+    TEXTURE = 'texture'
+    ROLLING_SHUTTER = 'rolling shutter'
+
+    @property
+    def is_property(self) -> bool:
+        """Whether this is a property of a recording, which only `check` reports."""
+        return tuple(Code).index(self) >= tuple(Code).index(Code.TOPICS)
+
+
+class Why(str, Enum):
+    """Why a finding has its state."""
+
+    CONSISTENT = 'consistent'
+    # Without a value: state UNKNOWN.
+    NOT_OBSERVABLE = 'not_observable'  # in this motion, or by so few pairs
+    NOT_MEASURED = 'not_measured'
+    OTHER_INCONSISTENT = 'other_inconsistent'  # another parameter is, which hides this one
+    OTHER_WRONG = 'other_wrong'  # the finding `parent` is, which hides this one
+    # Inconsistent, with an estimate.
+    OFF = 'off'
+    BY_CALIBRATION = 'by_calibration'  # an offline calibration contradicts the parameter
+    # Inconsistent, without an estimate in small steps.
+    OPPOSITE = 'opposite'  # the opposite sign fits
+    NO_SPECIFIC_FORCE = 'no_specific_force'
+    RECTIFIED = 'rectified'
+    # Gross errors: `is_gross`.
+    GROSS = 'gross'
+    LEFT_HANDED = 'left_handed'
+    INDEPENDENT = 'independent'  # images and gyro rotate independently
+    CLOCKS_APART = 'clocks_apart'
+    CLOCKWISE = 'clockwise'  # images rotated by 90 deg
+    COUNTERCLOCKWISE = 'counterclockwise'
+    UPSIDE_DOWN = 'upside_down'
+    MIRRORED = 'mirrored'
+
+    @property
+    def is_gross(self) -> bool:
+        """Whether it is an error of axes, unit, clocks or images that no small step reaches."""
+        return tuple(Why).index(self) >= tuple(Why).index(Why.GROSS)
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a finding is based on; None if it does not apply."""
+
+    sigmas: float | None = None  # certainty of the deviation
+    shift: float | None = None  # of the pose by the deviation, in its sigmas
+    pairs: int | None = None  # number of pairs
+    log_likelihood: float | None = None  # of the configuration, against no information
+    # Numbers of this cause alone, SI units unless the key names another one.
+    measured: Mapping[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """State of one quantity: a configured parameter, or a property of a recording."""
 
-    quantity: str  # e.g. 'time_offset' (`QUANTITIES`) or 'image rate'
+    code: Code
     state: FindingState
-    message: str  # the values, with units
-    fix: str = ''  # suggested; empty if nothing needs to be done
-    configured: float | None = None  # value of a parameter, as it is applied
-    estimated: float | None = None  # None if it is not observable
-    sigma: float | None = None  # of `estimated`
-    unit: str = ''
-    observable: bool = False  # in the motion of the last seconds
-    # Numbers of a property of a recording, SI units unless the key names another one.
-    measured: Mapping[str, Any] | None = None
+    why: Why
+    configured: tuple[float, ...] = ()  # values of a parameter as they are applied
+    estimated: tuple[float, ...] = ()  # empty if they are not observable
+    sigma: float | None = None  # of the estimated value `component`
+    unit: str = ''  # of the values and of sigma
+    component: int = 0  # index of the value that deviates most
+    evidence: Evidence = field(default_factory=Evidence)
+    candidates: tuple[Code, ...] = ()  # causes that fit as well, this one included
+    parent: Code | None = None  # the finding that this one follows from
+    # Parameters whose value removes the inconsistency; each of them does by itself.
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def description(self) -> str:
-        """Message and suggested fix."""
-        return self.message + (f': {self.fix}' if self.fix else '')
+    def told(self) -> float | None:
+        """The configured value that deviates most; None without one."""
+        return self.configured[self.component] if self.configured else None
 
     @property
-    def text(self) -> str:
-        """Quantity, state and description, as a line of a log."""
-        return f'{self.quantity} is {self.state.value}: {self.description}'
+    def seen(self) -> float | None:
+        """The estimated value that deviates most; None without one."""
+        return self.estimated[self.component] if self.estimated else None
 
-    def as_json(self) -> dict[str, Any]:
-        """The finding in summary.json."""
-        return {
-            'figure': self.quantity,
-            'told': self.configured,
-            'seen': self.estimated,
-            'sigma': self.sigma,
-            'unit': self.unit,
-            'observable': self.observable,
-            'state': self.state.value,
-            'sentence': self.description,
-        }
-
-    def as_check_json(self) -> dict[str, Any]:
-        """The finding in `check --json`."""
-        return {
-            'name': self.quantity,
-            'verdict': self.state.verdict,
-            'text': self.message,
-            'remedy': self.fix,
-            'figures': self.as_json() if self.measured is None else dict(self.measured),
-        }
+    @property
+    def observable(self) -> bool:
+        """Whether the motion of the last seconds determines the quantity."""
+        return bool(self.estimated) or self.state is not FindingState.UNKNOWN
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,23 +198,8 @@ class Assessment:
 
     @property
     def is_gross(self) -> bool:
-        """Whether the worst finding is a gross error (axes, unit, geometry), without a sigma."""
-        return self.state is FindingState.WRONG and self.faults[0].sigma is None
-
-    @property
-    def text(self) -> str:
-        """Quantity, state and description of each finding, in one line."""
-        return '; '.join(
-            f'{finding.quantity} {finding.state.value}: {finding.description}'
-            for finding in self.findings
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """The assessment in summary.json."""
-        return {
-            'state': self.state.value,
-            'findings': [finding.as_json() for finding in self.findings],
-        }
+        """Whether the worst finding is a gross error."""
+        return self.state is FindingState.WRONG and self.faults[0].why.is_gross
 
 
 NOT_EVALUATED = Assessment(())
@@ -150,147 +208,64 @@ NOT_EVALUATED = Assessment(())
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
     """The worse or later finding of each quantity; without traces of a gross error found later."""
     traces = now.is_gross and not before.is_gross
-    found = {} if traces else {finding.quantity: finding for finding in before.findings}
+    found = {} if traces else {finding.code: finding for finding in before.findings}
     # What was observable once is known.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:
-        if order.index(found.setdefault(one.quantity, one).state) <= order.index(one.state):
-            found[one.quantity] = one
+        if order.index(found.setdefault(one.code, one).state) <= order.index(one.state):
+            found[one.code] = one
     return Assessment(tuple(found.values()))
 
 
 def rounded(values: ArrayLike, digits: int = 5) -> list[float]:
-    """Values (K,) for a message; never -0.0."""
+    """Values (K,) to set or to show; never -0.0."""
     return [round(float(value), digits) + 0.0 for value in np.atleast_1d(values)]
 
 
 class Quantity(NamedTuple):
-    """A parameter of camera or IMU that images and gyro determine, and how it is reported."""
+    """A parameter of camera or IMU that images and gyro determine."""
 
-    name: str
+    code: Code
     part: slice  # of the deviations
     observable: float  # largest sigma of an observable deviation
     unit: str  # of a finding; deviations are in rad instead of deg, relative instead of px
-    shown: str  # unit of messages, `factor` times smaller
-    factor: float
-    digits: int
-    text: str  # {}: the estimated and the active value
-    fix: str  # {}: the value to set
     tracking: str = ''  # parameter that has it tracked
     reach: float = 0.0  # largest deviation that tracking applies
 
-    def unknown(self, reason: str) -> Finding:
+    def unknown(self, why: Why, parent: Code | None = None) -> Finding:
         """A finding without values."""
-        return Finding(self.name, FindingState.UNKNOWN, reason, unit=self.unit)
-
-    def number(self, values: ArrayLike) -> str:
-        """A value, or a list of those of a vector, in the unit of messages but without it."""
-        shown = self.factor * np.atleast_1d(values)
-        return (
-            f'{shown[0]:z.{self.digits}f}' if len(shown) == 1 else str(rounded(shown, self.digits))
-        )
-
-    def with_sigma(self, values: ArrayLike, sigma: float) -> str:
-        """A value with its sigma, in the unit of messages."""
-        return f'{self.number(values)} +- {self.number(sigma)} {self.shown}'.rstrip()
-
-    def compared(self, estimated: ArrayLike, sigma: float, active: ArrayLike) -> str:
-        """Estimated and active value, in words."""
-        return self.text.format(
-            self.with_sigma(estimated, sigma), f'{self.number(active)} {self.shown}'.rstrip()
-        )
+        return Finding(self.code, FindingState.UNKNOWN, why, unit=self.unit, parent=parent)
 
     def deviation(self, finding: Finding) -> float:
         """Size of the difference between the values of a finding, in units of a deviation."""
-        assert finding.estimated is not None and finding.configured is not None
-        apart = abs(finding.estimated - finding.configured)
+        assert finding.seen is not None and finding.told is not None
+        apart = abs(finding.seen - finding.told)
         if self.unit == 'px':
-            return apart / finding.configured
+            return apart / finding.told
         return math.radians(apart) if self.unit == 'deg' else apart
 
 
-_COMPARED = 'estimated {}, active {}'
 QUANTITIES = (
+    Quantity(Code.AXES, AXES, math.radians(1.0), 'deg'),
     Quantity(
-        'axes',
-        AXES,
-        math.radians(1.0),
-        'deg',
-        'deg',
-        1.0,
-        2,
-        'IMU rotated by {} relative to quat_cam_imu_xyzw',
-        'set quat_cam_imu_xyzw: {}',
-    ),
-    Quantity(
-        'time_offset',
+        Code.TIME_OFFSET,
         slice(OFFSET, OFFSET + 1),
         4e-3,
         's',
-        'ms',
-        1e3,
-        2,
-        _COMPARED,
-        'set time_offset: {:z.4f}',
         'track_time_offset',
         LARGEST_OFFSET,
     ),
     Quantity(
-        'readout_time',
+        Code.READOUT_TIME,
         slice(READOUT, READOUT + 1),
         5e-3,
         's',
-        'ms',
-        1e3,
-        2,
-        _COMPARED,
-        'set readout_time: {:.4f}',
         'track_readout_time',
         LARGEST_READOUT,
     ),
-    Quantity(
-        'gyro_bias',
-        BIAS,
-        0.01,
-        'rad/s',
-        'rad/s',
-        1.0,
-        5,
-        _COMPARED,
-        'set gyro_bias: {}, and keep the camera at rest at the start',
-    ),
-    Quantity(
-        'gyro_scale',
-        slice(SCALE, SCALE + 1),
-        0.03,
-        '',
-        '',
-        1.0,
-        3,
-        'factor of the gyro rates: ' + _COMPARED,
-        'calibrate the gyro, or correct its driver',
-    ),
-    Quantity(
-        'focal_length',
-        slice(FOCAL, FOCAL + 1),
-        0.04,
-        'px',
-        'px',
-        1.0,
-        1,
-        _COMPARED,
-        'calibrate the camera at this resolution and focus',
-    ),
-    Quantity(
-        'distortion',
-        slice(DISTORTION, DISTORTION + 1),
-        0.05,
-        '',
-        '',
-        1.0,
-        3,
-        'first coefficient: ' + _COMPARED,
-        'calibrate the lens',
-    ),
+    Quantity(Code.GYRO_BIAS, BIAS, 0.01, 'rad/s'),
+    Quantity(Code.GYRO_SCALE, slice(SCALE, SCALE + 1), 0.03, ''),
+    Quantity(Code.FOCAL_LENGTH, slice(FOCAL, FOCAL + 1), 0.04, 'px'),
+    Quantity(Code.DISTORTION, slice(DISTORTION, DISTORTION + 1), 0.05, ''),
 )
-BY_NAME = {quantity.name: quantity for quantity in QUANTITIES}
+BY_CODE = {quantity.code: quantity for quantity in QUANTITIES}

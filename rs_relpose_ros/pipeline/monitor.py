@@ -14,7 +14,7 @@ from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
-from rs_relpose_ros.pipeline import assessment, findings, recursion
+from rs_relpose_ros.pipeline import assessment, findings, findings_text, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
 from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, Finding, OFFSET, READOUT
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
@@ -159,7 +159,7 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
         return pose
     return RelativePose(
         status=Status.WITHHELD,
-        reason=health.faults[0].text,
+        reason=findings_text.line(health.faults[0]),
         inliers=pose.inliers,
         diagnostics=Diagnostics(
             model=pose.diagnostics.model,

@@ -16,7 +16,7 @@ from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
-from rs_relpose_ros.pipeline.findings import Finding, FindingState
+from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.recursion import LastSeconds, MOST_PAIRS, WINDOW_NS
 
 # Fewer rays give no rotation.
@@ -160,14 +160,17 @@ class AccelerationSums(LastSeconds):
 
     def __init__(self) -> None:
         super().__init__(MOST_PAIRS, WINDOW_NS)
-        self._fault, self._fault_ns, self._faulty = '', 0, False  # of the samples
+        # Fault of the samples, the stamp of its first pair, and whether it lasts.
+        self._fault: ForceFault | None = None
+        self._fault_ns, self._faulty = 0, False
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
         """Note the acceleration of a pair, or the reason why it has none."""
-        if not (isinstance(inertial, ForceFault) and self._fault):
+        fault = inertial if isinstance(inertial, ForceFault) else None
+        if fault is None or self._fault is None:
             self._fault_ns = stamp_ns
-        self._fault = inertial if isinstance(inertial, ForceFault) else ''
-        self._faulty = bool(self._fault) and stamp_ns - self._fault_ns >= _FAULTY_NS
+        self._fault = fault
+        self._faulty = fault is not None and stamp_ns - self._fault_ns >= _FAULTY_NS
 
     def add(self, stamp_ns: int, evidence: InertialEvidence) -> None:
         """Add a pair."""
@@ -185,32 +188,22 @@ class AccelerationSums(LastSeconds):
 
     def finding(self) -> Finding | None:
         """On the accelerometer; None if the pairs do not determine it."""
-        if self._faulty:
-            message, _, fix = self._fault.partition(': ')
-            return Finding('accel_scale', FindingState.SUSPECT, message, fix, observable=True)
-        configured, opposite = self._sums()
-        likelihood = f'with the images (log-likelihood {configured:+.0f})'
-        if self.contradicts:
+        if self._fault is not None and self._faulty:
+            measured = {'mean_length_m_s2': self._fault.length}
             return Finding(
-                'accel_axes',
+                Code.ACCEL_SCALE,
                 FindingState.SUSPECT,
-                f'accelerometer inconsistent {likelihood}, not used until both agree',
-                'reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
-                if opposite > _CERTAIN
-                else 'correct the driver: the axes differ from those of '
-                'the gyro, or the data are of another IMU',
-                observable=True,
+                Why.NO_SPECIFIC_FORCE,
+                evidence=Evidence(measured=measured),
             )
-        return (
-            Finding(
-                'accel_axes',
-                FindingState.OK,
-                f'accelerometer consistent {likelihood}',
-                observable=True,
-            )
-            if configured > _CERTAIN
-            else None
-        )
+        configured, opposite = self._sums()
+        evidence = Evidence(pairs=len(self), log_likelihood=configured)
+        if self.contradicts:
+            why = Why.OPPOSITE if opposite > _CERTAIN else Why.OFF
+            return Finding(Code.ACCEL_AXES, FindingState.SUSPECT, why, evidence=evidence)
+        if configured > _CERTAIN:
+            return Finding(Code.ACCEL_AXES, FindingState.OK, Why.CONSISTENT, evidence=evidence)
+        return None
 
     def _sums(self) -> tuple[float, float]:
         return sum(configured for _, configured, _ in self), sum(one for _, _, one in self)

@@ -1,0 +1,407 @@
+"""The text of findings, for logs, messages and JSON: the only place that makes it.
+
+No code reads a text back. What another process needs of a finding, `message_json` writes as codes
+and numbers, and `read_message_json` makes the same finding of them, which has the same text.
+
+A new cause needs a function in `_BY_CAUSE`; a new parameter that images and gyro determine needs
+an entry in `_SHOWN` instead, and has the texts of the others.
+"""
+
+from collections.abc import Callable, Mapping
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import clocks_apart
+from rs_relpose_ros.imu.buffer import ForceFault
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    rounded,
+    Why,
+)
+
+# Longest text [characters] that is read as findings of a message: those of all causes at once
+# need a tenth of it. [chosen: 20,000 to 1,000,000 would do; it bounds the work of a reader]
+_LONGEST = 100_000
+
+
+class Text(NamedTuple):
+    """What a finding says, with units, and the suggested fix; empty if there is nothing to do."""
+
+    message: str
+    fix: str = ''
+
+    @property
+    def description(self) -> str:
+        """Message and suggested fix."""
+        return self.message + (f': {self.fix}' if self.fix else '')
+
+
+class _Shown(NamedTuple):
+    """How the values of a parameter are written."""
+
+    unit: str  # `factor` times smaller than the unit of the values
+    factor: float
+    digits: int
+    compared: str  # {}: the estimated and the active value
+    fix: str  # {}: the value to set
+
+
+_COMPARED = 'estimated {}, active {}'
+_SHOWN = {
+    Code.AXES: _Shown(
+        'deg',
+        1.0,
+        2,
+        'IMU rotated by {} relative to quat_cam_imu_xyzw',
+        'set quat_cam_imu_xyzw: {}',
+    ),
+    Code.TIME_OFFSET: _Shown('ms', 1e3, 2, _COMPARED, 'set time_offset: {:z.4f}'),
+    Code.READOUT_TIME: _Shown('ms', 1e3, 2, _COMPARED, 'set readout_time: {:.4f}'),
+    Code.GYRO_BIAS: _Shown(
+        'rad/s',
+        1.0,
+        5,
+        _COMPARED,
+        'set gyro_bias: {}, and keep the camera at rest at the start',
+    ),
+    Code.GYRO_SCALE: _Shown(
+        '',
+        1.0,
+        3,
+        'factor of the gyro rates: ' + _COMPARED,
+        'calibrate the gyro, or correct its driver',
+    ),
+    Code.FOCAL_LENGTH: _Shown(
+        'px', 1.0, 1, _COMPARED, 'calibrate the camera at this resolution and focus'
+    ),
+    Code.DISTORTION: _Shown('', 1.0, 3, 'first coefficient: ' + _COMPARED, 'calibrate the lens'),
+}
+
+
+def with_sigma(code: Code, values: ArrayLike, sigma: float) -> str:
+    """Values of a parameter with their sigma, in the unit of messages."""
+    shown = _SHOWN[code]
+    return f'{_number(code, values)} +- {_number(code, sigma)} {shown.unit}'.rstrip()
+
+
+def _number(code: Code, values: ArrayLike) -> str:
+    """A value, or a list of those of a vector, in the unit of messages but without it."""
+    shown = _SHOWN[code]
+    scaled = shown.factor * np.atleast_1d(values)
+    if len(scaled) > 1:
+        return str(rounded(scaled, shown.digits))
+    return f'{scaled[0]:z.{shown.digits}f}'
+
+
+# -- the text of a finding by its cause -----------------------------------------------------
+
+
+def text_of(finding: Finding) -> Text:
+    """Message and fix of a finding; KeyError for a cause without a text."""
+    write = _BY_CAUSE.get((finding.code, finding.why)) or _BY_WHY[finding.why]
+    return write(finding)
+
+
+def item(finding: Finding) -> str:
+    """Code, state and description, as an item of a list."""
+    return f'{finding.code.value} {finding.state.value}: {text_of(finding).description}'
+
+
+def line(finding: Finding) -> str:
+    """The same as a line of a log."""
+    return f'{finding.code.value} is {finding.state.value}: {text_of(finding).description}'
+
+
+def one_line(health: Assessment) -> str:
+    """All findings in one line."""
+    return '; '.join(map(item, health.findings))
+
+
+def _compared(finding: Finding) -> str:
+    """Estimated and active value, in words."""
+    assert finding.sigma is not None
+    shown = _SHOWN[finding.code]
+    estimated = with_sigma(finding.code, finding.estimated, finding.sigma)
+    active = f'{_number(finding.code, finding.configured)} {shown.unit}'.rstrip()
+    return shown.compared.format(estimated, active)
+
+
+def _off(finding: Finding) -> Text:
+    """A parameter that the pairs contradict; the first of its settings is the value to set."""
+    settings = finding.settings
+    fix = _SHOWN[finding.code].fix.format(*settings.values())
+    for name in settings:
+        if name.startswith('track_'):
+            fix += f', or {name}: true'
+    if 'stamp_row' in settings:
+        fix += f' (stamp_row: {settings["stamp_row"]} is equivalent)'
+    if finding.candidates:
+        fix += f' (ambiguous: {" or ".join(code.value for code in finding.candidates)})'
+    return Text(
+        f'{_compared(finding)} (shifts the pose by {finding.evidence.shift:.1f} sigmas)', fix
+    )
+
+
+def _by_calibration(finding: Finding) -> Text:
+    fix = _SHOWN[finding.code].fix.format(*finding.settings.values())
+    return Text(f'by a calibration: {_compared(finding)}', fix)
+
+
+def _other_wrong(finding: Finding) -> Text:
+    assert finding.parent is not None
+    return Text(f'not evaluated while {finding.parent.value} is wrong')
+
+
+_BY_WHY: dict[Why, Callable[[Finding], Text]] = {
+    Why.CONSISTENT: lambda finding: Text(_compared(finding)),
+    Why.NOT_OBSERVABLE: lambda _: Text('not observable in this motion, or too few pairs'),
+    Why.OTHER_INCONSISTENT: lambda _: Text(
+        'not evaluated while another parameter is inconsistent'
+    ),
+    Why.OTHER_WRONG: _other_wrong,
+    Why.OFF: _off,
+    Why.BY_CALIBRATION: _by_calibration,
+}
+
+
+def _other_direction(finding: Finding) -> str:
+    return f'set readout_direction: {finding.settings["readout_direction"]}'
+
+
+def _direction_off(finding: Finding) -> Text:
+    assert finding.seen is not None and finding.sigma is not None
+    readout = with_sigma(Code.READOUT_TIME, -finding.seen, finding.sigma)
+    return Text(
+        f'rows are read in the opposite direction, in {readout}', _other_direction(finding)
+    )
+
+
+def _direction_by_calibration(finding: Finding) -> Text:
+    assert finding.seen is not None and finding.sigma is not None
+    estimated = with_sigma(Code.READOUT_TIME, -finding.seen, finding.sigma)
+    active = f'{_number(Code.READOUT_TIME, finding.configured)} ms'
+    return Text(
+        f'by a calibration: {_COMPARED.format(estimated, active)}, in the opposite direction',
+        _other_direction(finding),
+    )
+
+
+def _other_unit(finding: Finding) -> Text:
+    return Text(
+        f'images rotate {finding.seen:.3g} times as far as the gyro',
+        'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
+    )
+
+
+def _left_handed(finding: Finding) -> Text:
+    axis = finding.evidence.measured['axis']
+    return Text(
+        'the axes of the gyro are left-handed: '
+        + (f'wrong sign of {axis}' if axis else 'wrong sign of one or of all axes'),
+        'correct the driver (no quat_cam_imu_xyzw corrects a sign)',
+    )
+
+
+def _turned(finding: Finding) -> Text:
+    return Text(
+        f'rotation axes of the images are {finding.seen:.0f} deg from those of the gyro by '
+        f'quat_cam_imu_xyzw; about {finding.settings["quat_cam_imu_xyzw"]} fits',
+        'refine it with "rs_relpose calibrate" (a static transform with parent imu holds the '
+        'inverse)',
+    )
+
+
+def _on_their_side(finding: Finding) -> Text:
+    return Text(
+        f'alternatively, the images are rotated by 90 deg {finding.why.value}',
+        'publish them as the sensor provides them, with its CameraInfo: no other has rows that '
+        'are read one by one',
+    )
+
+
+def _flipped(finding: Finding) -> Text:
+    flip = finding.why.value.replace('_', ' ')
+    return Text(
+        f'alternatively, the images are {flip}', 'publish them as the sensor provides them'
+    )
+
+
+def _rectified(_: Finding) -> Text:
+    return Text(
+        'hardly any distortion left in the images: they may be rectified',
+        'subscribe to the original images',
+    )
+
+
+def _independent(_: Finding) -> Text:
+    return Text(
+        'images and gyro rotate independently of each other',
+        'verify that the IMU is that of this camera, that both stamp by one clock, and that '
+        'electronic stabilisation is off',
+    )
+
+
+def _clocks_apart(finding: Finding) -> Text:
+    return Text(
+        clocks_apart(finding.evidence.measured['ahead_s']),
+        'stamp both by one clock, or set time_offset: '
+        f'{finding.settings["time_offset"]:.2f} if they differ by a constant',
+    )
+
+
+def _no_specific_force(finding: Finding) -> Text:
+    fault = ForceFault(finding.evidence.measured['mean_length_m_s2'])
+    return Text(fault.message, fault.fix)
+
+
+def _with_the_images(finding: Finding) -> str:
+    return f'with the images (log-likelihood {finding.evidence.log_likelihood:+.0f})'
+
+
+def _accelerometer(finding: Finding) -> Text:
+    return Text(f'accelerometer consistent {_with_the_images(finding)}')
+
+
+def _contradicting_accelerometer(finding: Finding) -> Text:
+    return Text(
+        f'accelerometer inconsistent {_with_the_images(finding)}, not used until both agree',
+        'reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
+        if finding.why is Why.OPPOSITE
+        else 'correct the driver: the axes differ from those of the gyro, or the data are of '
+        'another IMU',
+    )
+
+
+_BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
+    (Code.READOUT_DIRECTION, Why.OFF): _direction_off,
+    (Code.READOUT_DIRECTION, Why.BY_CALIBRATION): _direction_by_calibration,
+    (Code.GYRO_UNIT, Why.GROSS): _other_unit,
+    (Code.AXES, Why.GROSS): _turned,
+    (Code.AXES, Why.LEFT_HANDED): _left_handed,
+    (Code.IMAGE_GEOMETRY, Why.CLOCKWISE): _on_their_side,
+    (Code.IMAGE_GEOMETRY, Why.COUNTERCLOCKWISE): _on_their_side,
+    (Code.IMAGE_GEOMETRY, Why.UPSIDE_DOWN): _flipped,
+    (Code.IMAGE_GEOMETRY, Why.MIRRORED): _flipped,
+    (Code.IMAGE_GEOMETRY, Why.RECTIFIED): _rectified,
+    (Code.IMAGE_GEOMETRY, Why.INDEPENDENT): _independent,
+    (Code.TIME_OFFSET, Why.INDEPENDENT): _independent,
+    (Code.TIME_OFFSET, Why.CLOCKS_APART): _clocks_apart,
+    (Code.ACCEL_SCALE, Why.NO_SPECIFIC_FORCE): _no_specific_force,
+    (Code.ACCEL_AXES, Why.CONSISTENT): _accelerometer,
+    (Code.ACCEL_AXES, Why.OPPOSITE): _contradicting_accelerometer,
+    (Code.ACCEL_AXES, Why.OFF): _contradicting_accelerometer,
+}
+
+
+# -- JSON: summary.json, `check --json`, and the key `findings` of messages -----------------
+
+
+def summary_json(health: Assessment) -> dict[str, Any]:
+    """The assessment in summary.json."""
+    return {
+        'state': health.state.value,
+        'findings': [
+            figures(finding, text_of(finding)) | facts(finding) for finding in health.findings
+        ],
+    }
+
+
+def figures(finding: Finding, text: Text) -> dict[str, Any]:
+    """The keys of a finding that the second release introduced."""
+    return {
+        'figure': finding.code.value,
+        'told': finding.told,
+        'seen': finding.seen,
+        'sigma': finding.sigma,
+        'unit': finding.unit,
+        'observable': finding.observable,
+        'state': finding.state.value,
+        'sentence': text.description,
+    }
+
+
+def facts(finding: Finding) -> dict[str, Any]:
+    """The keys of a finding that the fourth release introduced."""
+    evidence = finding.evidence
+    return {
+        'code': finding.code.value,
+        'why': finding.why.value,
+        'configured': list(finding.configured),
+        'estimated': list(finding.estimated),
+        'evidence': {
+            'sigmas': evidence.sigmas,
+            'shift': evidence.shift,
+            'pairs': evidence.pairs,
+            'log_likelihood': evidence.log_likelihood,
+            'measured': dict(evidence.measured),
+        },
+        'candidates': [code.value for code in finding.candidates],
+        'parent': finding.parent and finding.parent.value,
+        'settings': dict(finding.settings),
+    }
+
+
+def message_json(health: Assessment) -> str:
+    """Codes and numbers of all findings, for the key `findings` of a message."""
+    return json.dumps(
+        [
+            facts(finding)
+            | {
+                'state': finding.state.value,
+                'sigma': finding.sigma,
+                'unit': finding.unit,
+                'component': finding.component,
+            }
+            for finding in health.findings
+        ],
+        separators=(',', ':'),
+    )
+
+
+def read_message_json(text: str) -> Assessment:
+    """The findings of a message; InputError if they are malformed or of an unknown cause."""
+    try:
+        if len(text) > _LONGEST:
+            raise ValueError(f'{len(text)} characters')
+        health = Assessment(tuple(map(_finding, json.loads(text))))
+        one_line(health)  # each has a text
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise InputError(
+            'findings of a message must be those of a relpose_node of this release, got '
+            f'{text[:60]!r} ({type(error).__name__})'
+        ) from error
+    return health
+
+
+def _finding(values: Mapping[str, Any]) -> Finding:
+    evidence = values['evidence']
+    return Finding(
+        Code(values['code']),
+        FindingState(values['state']),
+        Why(values['why']),
+        tuple(map(float, values['configured'])),
+        tuple(map(float, values['estimated'])),
+        None if values['sigma'] is None else float(values['sigma']),
+        str(values['unit']),
+        int(values['component']),
+        Evidence(**evidence),
+        tuple(map(Code, values['candidates'])),
+        None if values['parent'] is None else Code(values['parent']),
+        dict(values['settings']),
+    )
