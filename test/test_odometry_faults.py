@@ -345,7 +345,7 @@ def test_faults_are_reported(session):
     for expected in (
         'uncertain: no usable pair for 0.',
         'lost: no usable pair for 2 s',
-        'lost: time_offset wrong: off',
+        'lost: time_offset wrong: images and gyro rotate independently of each other',
     ):
         [line] = [line for line in lines if expected in line]
         assert line.startswith('[ERROR]') == expected.startswith('lost')
