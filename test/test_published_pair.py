@@ -263,8 +263,8 @@ def changed_records(name: str, change: Callable[[np.ndarray], object]) -> Callab
         ('pairs', 'status.0.values.0.value', '-5', 'reference_stamp_ns .* a timestamp'),
         ('pairs', 'status.0.values.-5.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
         ('pairs', 'status.0.values.-5.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
-        ('pairs', 'status.0.values.-6.value', '0.1 0.2', 'image_information .* unknowns'),
-        ('pairs', 'status.0.values.-6.value', '0.1 0.2 inf', 'image_gradient .* finite'),
+        ('pairs', 'status.0.values.-7.value', '0.1 0.2', 'image_information .* unknowns'),
+        ('pairs', 'status.0.values.-7.value', '0.1 0.2 inf', 'image_gradient .* finite'),
         ('pairs', 'status.0.values.-1.value', 'matches', 'must name all others'),
         (
             'pairs',
