@@ -437,7 +437,7 @@ def test_missing_parameters_are_estimated(short_bag):
     assert 'cam x = -imu y, cam y = -imu z, cam z = +imu x' in findings['axes'].message
     assert 'bottom' in findings['axes'].message  # direction of gravity
     readout = findings['readout_time']
-    assert (readout.configured, readout.seen) == (None, pytest.approx(0.03, abs=2e-3))
+    assert (readout.configured, readout.estimate) == (None, pytest.approx(0.03, abs=2e-3))
     assert abs(findings['time_offset'].estimated) < 3e-3
     assert findings['rolling shutter'].measured['readout_s'] == pytest.approx(0.03, abs=2e-3)
 
@@ -565,14 +565,14 @@ def test_a_calibration_contradicts_wrong_parameters_in_every_convention(conventi
     unknown = found_by(*convention, offset_observable=False)
     assert contradictions(unknown, *convention, time_offset=0.2) == ()
     (offset,) = contradictions(found, *convention, time_offset=0.01)
-    assert (offset.code, offset.told) == ('time_offset', 0.01)
-    assert offset.seen == pytest.approx(-0.03, abs=1e-6)
+    assert (offset.code, offset.active) == ('time_offset', 0.01)
+    assert offset.estimate == pytest.approx(-0.03, abs=1e-6)
     assert text_of(offset).fix == 'set time_offset: -0.0300'
     (readout,) = contradictions(found, *convention, readout_time=0.05)
-    assert (readout.code, readout.told) == ('readout_time', pytest.approx(0.05))
-    assert readout.seen == pytest.approx(0.024, abs=1e-9)
+    assert (readout.code, readout.active) == ('readout_time', pytest.approx(0.05))
+    assert readout.estimate == pytest.approx(0.024, abs=1e-9)
     (axes,) = contradictions(found, *convention, quat_cam_imu_xyzw=(0.0, 0.0, 0.0, 1.0))
-    assert axes.code == 'axes' and axes.seen == pytest.approx(120.0)
+    assert axes.code == 'axes' and axes.estimate == pytest.approx(120.0)
     assert text_of(axes).fix == 'set quat_cam_imu_xyzw: [0.5, -0.5, 0.5, -0.5]'
     row, direction, exposure = convention
     if row == 'middle':  # which keeps its time

@@ -456,7 +456,7 @@ def test_a_gyro_with_little_more_than_its_bias(rotating):
     faults = faults_of(sums)
     assert [fault.code for fault in faults] == (['gyro_unit'] if rotating else [])
     if rotating:
-        assert faults[0].seen == pytest.approx(math.degrees(1.0), rel=0.02)
+        assert faults[0].estimate == pytest.approx(math.degrees(1.0), rel=0.02)
 
 
 def test_a_steady_translation_is_no_rotation():
@@ -662,7 +662,7 @@ def test_the_state_follows_the_shift_of_the_pose(size, state):
     health = assessed(calibration(deviation(offset=size), SIGMA))
     assert health.state is FindingState(state)
     (finding,) = (one for one in health.findings if one.code == 'time_offset')
-    assert (finding.told, finding.seen) == (
+    assert (finding.active, finding.estimate) == (
         0.004,
         pytest.approx(0.004 + size, abs=1e-5),
     )
@@ -713,17 +713,17 @@ def test_gross_errors_leave_the_other_quantities_unknown():
     assert {finding.state for finding in health.findings[1:]} == {FindingState.UNKNOWN}
 
 
-def finding(code, state, seen=1.0, why=Why.OFF):
+def finding(code, state, estimate=1.0, why=Why.OFF):
     return Finding(
         Code(code),
         state,
         Why.NOT_OBSERVABLE if state is UNKNOWN else why,
         (0.5,),
-        (seen,),
+        (estimate,),
         0.1,
         's',
         evidence=Evidence(shift=2.0),
-        settings={code: seen},
+        settings={code: estimate},
     )
 
 
@@ -739,7 +739,7 @@ def test_the_worst_of_a_run():
     assert [one.state for one in run.findings] == [OK, WRONG]
     assert run.state is WRONG
     later = worst_of(run, Assessment((finding('readout_time', WRONG, 2.0),)))
-    assert later.faults[0].seen == 2.0
+    assert later.faults[0].estimate == 2.0
     both = Assessment((finding('time_offset', SUSPECT), finding('readout_time', WRONG)))
     assert both.faults[0].code == 'readout_time'
     assert json.loads(json.dumps(summary_json(both)))['findings'][0] == {
@@ -1000,7 +1000,9 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
     assert any(len(names) <= 2 and right & set(names) for names in named), named
     if case.estimated is not None:
         fault = next(fault for fault in results[flagged[-1]].health.faults if fault.code in right)
-        assert fault.seen == pytest.approx(case.estimated, abs=4.0 * fault.sigma + case.tolerance)
+        assert fault.estimate == pytest.approx(
+            case.estimated, abs=4.0 * fault.sigma + case.tolerance
+        )
     for k, result in enumerate(results):
         state, pose = result.health.state, result.pose
         if state is FindingState.WRONG:

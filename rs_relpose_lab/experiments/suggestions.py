@@ -125,7 +125,9 @@ def on_recording(path: Path, parameter_file: Path) -> list[Suggestion]:
         }[wrong.quantity]
         size = abs(wrong.error(right)) / reference.sigma if reference and reference.sigma else 0.0
         estimated, sigma = (
-            (math.nan, math.nan) if last is None else (last.seen or 0.0, last.sigma or math.nan)
+            (math.nan, math.nan)
+            if last is None
+            else (last.estimate or 0.0, last.sigma or math.nan)
         )
         results.append(Suggestion(path.name, name, size, right, estimated, sigma, ' '.join(named)))
     return results

@@ -66,8 +66,8 @@ class Line(NamedTuple):
             'remedy': self.fix,
             'figures': dict(finding.evidence.measured)
             if finding.code.is_property
-            else findings_text.figures(finding, text),
-        } | findings_text.facts(finding)
+            else findings_text.earlier_keys(finding, text),
+        } | findings_text.new_keys(finding)
 
 
 def property_line(
@@ -810,10 +810,10 @@ def quantity_findings(health: Assessment, reason: str) -> Iterator[Line]:
 def _state(finding: Finding) -> FindingState:
     """State of a parameter by itself: a certain deviation counts even if no pose suffers."""
     if (
-        finding.told is None
-        or finding.seen is None
+        finding.active is None
+        or finding.estimate is None
         or finding.sigma is None
-        or abs(finding.seen - finding.told) < _CERTAIN * finding.sigma
+        or abs(finding.estimate - finding.active) < _CERTAIN * finding.sigma
     ):
         return finding.state
     quantity = BY_CODE.get(Code.READOUT_TIME if finding.code in _READOUT else finding.code)
@@ -862,8 +862,8 @@ def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Line | No
     configured = parameters.sensor.readout_time
     found = {finding.code: finding for finding in health.findings}.get(Code.READOUT_TIME)
     readout, source, state = configured, '', OK
-    if found is not None and found.seen is not None and _state(found) in (SUSPECT, WRONG):
-        readout, source = found.seen, ' as estimated'
+    if found is not None and found.estimate is not None and _state(found) in (SUSPECT, WRONG):
+        readout, source = found.estimate, ' as estimated'
     elif configured is None:
         readout, source, state = _EXAMPLE_READOUT, ' (assumed; set readout_time)', UNKNOWN
     elif configured == 0.0:

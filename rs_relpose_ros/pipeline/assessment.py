@@ -367,19 +367,19 @@ def _fault_findings(
     consistent = _values(quantity, left, sigmas, configured, estimated)
     evidence = replace(consistent.evidence, sigmas=one.certainty, shift=one.shift)
     found = replace(consistent, state=state, why=Why.OFF, evidence=evidence, candidates=candidates)
-    assert found.seen is not None
-    if quantity.code is Code.READOUT_TIME and found.seen < 0.0:
+    assert found.estimate is not None
+    if quantity.code is Code.READOUT_TIME and found.estimate < 0.0:
         other = 'up' if configured.sensor.readout_direction == 'down' else 'down'
         yield replace(found, code=Code.READOUT_DIRECTION, settings={'readout_direction': other})
         return
-    settings = _setting(found, left, configured) | _tracking(quantity, found.seen, configured)
+    settings = _setting(found, left, configured) | _tracking(quantity, found.estimate, configured)
     if quantity.code is Code.TIME_OFFSET:
         settings |= _equivalent_row(one, configured)
     yield replace(found, settings=settings)
     if (
         quantity.code is Code.DISTORTION
-        and found.told
-        and abs(found.seen) < _LITTLE_OF * abs(found.told)
+        and found.active
+        and abs(found.estimate) < _LITTLE_OF * abs(found.active)
     ):
         yield Finding(Code.IMAGE_GEOMETRY, state, Why.RECTIFIED, parent=Code.DISTORTION)
 
@@ -393,7 +393,7 @@ def _setting(found: Finding, left: Array, configured: Configured) -> dict[str, A
     if found.code is Code.GYRO_BIAS:
         return {'gyro_bias': findings.rounded(found.estimated)}
     if found.code in (Code.TIME_OFFSET, Code.READOUT_TIME):
-        return {found.code.value: found.seen}
+        return {found.code.value: found.estimate}
     return {}
 
 

@@ -156,12 +156,12 @@ class Finding:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def told(self) -> float | None:
+    def active(self) -> float | None:
         """The configured value that deviates most; None without one."""
         return self.configured[self.component] if self.configured else None
 
     @property
-    def seen(self) -> float | None:
+    def estimate(self) -> float | None:
         """The estimated value that deviates most; None without one."""
         return self.estimated[self.component] if self.estimated else None
 
@@ -238,10 +238,10 @@ class Quantity(NamedTuple):
 
     def deviation(self, finding: Finding) -> float:
         """Size of the difference between the values of a finding, in units of a deviation."""
-        assert finding.seen is not None and finding.told is not None
-        apart = abs(finding.seen - finding.told)
+        assert finding.estimate is not None and finding.active is not None
+        apart = abs(finding.estimate - finding.active)
         if self.unit == 'px':
-            return apart / finding.told
+            return apart / finding.active
         return math.radians(apart) if self.unit == 'deg' else apart
 
 

@@ -177,16 +177,16 @@ def _other_direction(finding: Finding) -> str:
 
 
 def _direction_off(finding: Finding) -> Text:
-    assert finding.seen is not None and finding.sigma is not None
-    readout = with_sigma(Code.READOUT_TIME, -finding.seen, finding.sigma)
+    assert finding.estimate is not None and finding.sigma is not None
+    readout = with_sigma(Code.READOUT_TIME, -finding.estimate, finding.sigma)
     return Text(
         f'rows are read in the opposite direction, in {readout}', _other_direction(finding)
     )
 
 
 def _direction_by_calibration(finding: Finding) -> Text:
-    assert finding.seen is not None and finding.sigma is not None
-    estimated = with_sigma(Code.READOUT_TIME, -finding.seen, finding.sigma)
+    assert finding.estimate is not None and finding.sigma is not None
+    estimated = with_sigma(Code.READOUT_TIME, -finding.estimate, finding.sigma)
     active = f'{_number(Code.READOUT_TIME, finding.configured)} ms'
     return Text(
         f'by a calibration: {_COMPARED.format(estimated, active)}, in the opposite direction',
@@ -196,7 +196,7 @@ def _direction_by_calibration(finding: Finding) -> Text:
 
 def _other_unit(finding: Finding) -> Text:
     return Text(
-        f'images rotate {finding.seen:.3g} times as far as the gyro',
+        f'images rotate {finding.estimate:.3g} times as far as the gyro',
         'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
     )
 
@@ -212,7 +212,7 @@ def _left_handed(finding: Finding) -> Text:
 
 def _turned(finding: Finding) -> Text:
     return Text(
-        f'rotation axes of the images are {finding.seen:.0f} deg from those of the gyro by '
+        f'rotation axes of the images are {finding.estimate:.0f} deg from those of the gyro by '
         f'quat_cam_imu_xyzw; about {finding.settings["quat_cam_imu_xyzw"]} fits',
         'refine it with "rs_relpose calibrate" (a static transform with parent imu holds the '
         'inverse)',
@@ -309,17 +309,18 @@ def summary_json(health: Assessment) -> dict[str, Any]:
     return {
         'state': health.state.value,
         'findings': [
-            figures(finding, text_of(finding)) | facts(finding) for finding in health.findings
+            earlier_keys(finding, text_of(finding)) | new_keys(finding)
+            for finding in health.findings
         ],
     }
 
 
-def figures(finding: Finding, text: Text) -> dict[str, Any]:
+def earlier_keys(finding: Finding, text: Text) -> dict[str, Any]:
     """The keys of a finding that the second release introduced."""
     return {
         'figure': finding.code.value,
-        'told': finding.told,
-        'seen': finding.seen,
+        'told': finding.active,
+        'seen': finding.estimate,
         'sigma': finding.sigma,
         'unit': finding.unit,
         'observable': finding.observable,
@@ -328,7 +329,7 @@ def figures(finding: Finding, text: Text) -> dict[str, Any]:
     }
 
 
-def facts(finding: Finding) -> dict[str, Any]:
+def new_keys(finding: Finding) -> dict[str, Any]:
     """The keys of a finding that the fourth release introduced."""
     evidence = finding.evidence
     return {
@@ -353,7 +354,7 @@ def message_json(health: Assessment) -> str:
     """Codes and numbers of all findings, for the key `findings` of a message."""
     return json.dumps(
         [
-            facts(finding)
+            new_keys(finding)
             | {
                 'state': finding.state.value,
                 'sigma': finding.sigma,
