@@ -20,7 +20,6 @@ from rs_relpose_ros.odometry.rows import camera_poses, ROWS_FILE, RowTrajectory,
 from rs_relpose_ros.offline import replay
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import beside, refuse_existing, refuse_unwritable, SUMMARY_FILE
-from rs_relpose_ros.pipeline import findings_text
 
 TUM = 'tum'
 
@@ -128,32 +127,7 @@ def _print_replay(outcome: replay.ReplayOutcome) -> None:
         )
         for reason, count in metrics['baselines']['not_known'].items():
             print(f'{reason} ({count} poses)')
-    _print_health(outcome)
-
-
-def _print_health(outcome: replay.ReplayOutcome) -> None:
-    """A line for each inconsistent parameter, or else one for all parameters."""
-    health = outcome.health
-    for fault in health.faults:
-        print(findings_text.line(fault))
-    if health.faults:
-        return
-    if not health.findings:
-        print('health: unknown: there was no pair to evaluate')
-        return
-    observed, unobserved = (
-        ', '.join(
-            finding.code.value for finding in health.findings if finding.observable is observable
-        )
-        for observable in (True, False)
-    )
-    if not unobserved:
-        print(f'health: ok ({observed} observed)')
-    else:
-        print(
-            f'health: unknown: {unobserved} not observable in this motion'
-            + (f' ({observed} ok)' if observed else '')
-        )
+    print(*outcome.health_lines(), sep='\n')
 
 
 def _print_errors(errors: Mapping[str, float] | None) -> None:

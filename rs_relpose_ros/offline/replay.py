@@ -31,7 +31,7 @@ from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
 from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED, worst_of
-from rs_relpose_ros.pipeline.findings_text import summary_json
+from rs_relpose_ros.pipeline.findings_text import summary_json, summary_lines
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused
@@ -183,6 +183,10 @@ class ReplayOutcome:
     health: Assessment  # the worst finding of each configured parameter
     files: list[Path]  # written so far: tables, bag and pictures
     intrinsics: Intrinsics | None  # active at the end
+
+    def health_lines(self) -> list[str]:
+        """Lines on the calibration for the console."""
+        return summary_lines(self.health)
 
 
 def replay_into(

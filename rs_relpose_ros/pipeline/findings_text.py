@@ -125,6 +125,24 @@ def one_line(health: Assessment) -> str:
     return '; '.join(map(item, health.findings))
 
 
+def summary_lines(health: Assessment) -> list[str]:
+    """A line for each inconsistent parameter, or else one for all parameters."""
+    if health.faults:
+        return list(map(line, health.faults))
+    if not health.findings:
+        return ['health: unknown: there was no pair to evaluate']
+    observed, unobserved = (
+        ', '.join(
+            finding.code.value for finding in health.findings if finding.observable is observable
+        )
+        for observable in (True, False)
+    )
+    if not unobserved:
+        return [f'health: ok ({observed} observed)']
+    also = f' ({observed} ok)' if observed else ''
+    return [f'health: unknown: {unobserved} not observable in this motion{also}']
+
+
 def _compared(finding: Finding) -> str:
     """Estimated and active value, in words."""
     assert finding.sigma is not None
