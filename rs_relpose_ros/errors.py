@@ -1,4 +1,4 @@
-"""Exceptions of the package, with one root class; packages that may be absent."""
+"""Exceptions of the package, with one root class, and packages that may be absent."""
 
 import importlib.util
 from types import ModuleType
@@ -9,7 +9,7 @@ class RsRelposeError(Exception):
 
 
 class InputError(RsRelposeError, ValueError):
-    """An unusable value, file or message; the text has what is legal and what was given."""
+    """An unusable value, file or message; the text says what is legal and what was given."""
 
 
 class MissingInputError(RsRelposeError):
@@ -17,7 +17,7 @@ class MissingInputError(RsRelposeError):
 
 
 def library(module: str, absent: str) -> ModuleType:
-    """Import a module; MissingInputError with the message `absent` if there is no such package."""
+    """Import a module; a missing package raises MissingInputError with the text `absent`."""
     if importlib.util.find_spec(module.partition('.')[0]) is None:
         raise MissingInputError(absent)
     return importlib.import_module(module)

@@ -23,38 +23,56 @@ from rs_relpose_ros.messages.incoming import Role, stamp_ns
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
-# Length of the recording [s]: of the first fit; kept at most; added before the next fit.
+# Length of the recording at the first fit [s]. A shorter recording rarely determines anything, and
+# a fit of it takes the core from the tracker. [chosen: any value in 5..10 would do]
 _FIRST = 7.0
+# Longest recording that is kept [s]; older data are dropped. A longer one costs memory and time of
+# each fit, and its sigmas are no longer the limit. [chosen: any value in 40..120 would do]
 _LONGEST = 60.0
+# Length that is added before the next fit [s]. A larger value delays the end of the calibration, a
+# smaller one repeats fits of the same data. [chosen: about the duration of a fit]
 _STEP = 1.0
-# Values with wider sigmas suffice, as their doubt is in the covariances: factors of the limits,
-# and of those where the doubt moves poses by less than their own sigma.
+# Factor of the largest sigmas with which a running node accepts a value: the covariances of its
+# poses contain this doubt, so poses start earlier. [chosen: any value in 1.5..3 would do]
 _WIDER = 2.0
+# The same factor where the doubt moves poses by less than their own sigma. [chosen: any value
+# above the factor before, up to 5, would do]
 _UNNOTICED = 3.0
-# From this length [s] on the rotation of a transform suffices: wheels turn about one axis only.
+# Length of the recording [s] from which the rotation of a transform suffices, since a vehicle with
+# wheels turns about one axis only and never determines it. A smaller value would take the rotation
+# of a transform from a camera that is still to be turned. [chosen: the duration of the motion that
+# the user is asked for]
 _WHEELS = 20.0
-# Images that wait to be tracked; more are left out.
+# Images that may wait to be tracked; more are left out. A larger value delays the fits behind the
+# camera on a slow machine, a smaller one loses images while the tracker starts. [chosen: a quarter
+# of a second of images]
 _WAITING = 8
-# Time without an image [s] after which a recording that is too short is reported.
+# Time without an image [s] after which a recording that is too short is reported. It must exceed
+# the gaps of a slow transport. [chosen: any value in 1..5 would do]
 _SILENCE = 2.0
-# Images without a usable CameraInfo after which the lens counts as uncalibrated.
+# Images without a usable CameraInfo after which the lens counts as uncalibrated: the first
+# CameraInfo may arrive after the first images. [chosen: half a second of images]
 _WITHOUT_INFO = 15
-# Consecutive unusable images after which the recording starts again (other size), or goes on with
-# a clock that was set back.
+# Consecutive unusable images after which the recording starts again because the images have
+# another size, or goes on with a clock that was set back. A smaller value would restart at a burst
+# of damaged images. [chosen: half a second of images]
 _MOST_REFUSED = 15
 # Niceness of the process of the fits: the node goes first, but a loaded machine still ends a fit.
+# At 19 it would get no time there. [chosen: any value in 1..10 would do]
 _NICE = 5
 
 
 class LiveCalibration:
     """Takes the place of intake and frame loop until the calibration is known.
 
-    `receive` is for the thread of the subscriptions, `step` for the worker. With `use_stored` the
-    file of the camera is used, if there is one. `waits_for`: what others will give, in place of
-    a fit. `topic`: of the images. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
+    The thread of the subscriptions calls `receive`, and the worker calls `step`. With
+    `use_stored`, the file of the camera is used if there is one. `waits_for` names what another
+    part will give, so that no fit is needed. `topic` is the topic of the images. `quat_prior` is
+    the rotation IMU to camera of a transform, which is right within 5 deg.
     """
 
-    camera_info_problem = ''  # an uncalibrated CameraInfo is none: the lens is calibrated, too
+    # An uncalibrated CameraInfo is no problem here, because the lens is calibrated, too.
+    camera_info_problem = ''
 
     def __init__(
         self, parameters: Parameters, *, use_stored: bool, waits_for: str = '', topic: str = ''
@@ -65,7 +83,8 @@ class LiveCalibration:
         self.waits_for = waits_for
         self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
-        # Images put into the queue by `receive`, or not, and taken by `step`: a thread each.
+        # Images that `receive` put into the queue or left out, and that `step` took from it: each
+        # number is written by one thread.
         self._put = self._left_out = self._taken = 0
         self._image_s = 0.0  # time of the last image on the monotonic clock
         self._short = 0.0  # length of a recording that was reported as too short [s]
@@ -78,11 +97,11 @@ class LiveCalibration:
         self.close()
         self._recorder = Recorder(self._parameters.tracking, _LONGEST)
         self._images = self._refused = 0
-        self._fitted_ns = 0  # stamp of the last image at the begin of the last fit
+        self._fitted_ns = 0  # stamp of the last image when the last fit began
 
     @property
     def intrinsics(self) -> Intrinsics | None:
-        """Those of the last CameraInfo."""
+        """Intrinsics of the last CameraInfo."""
         return self._recorder.intrinsics
 
     @property
@@ -91,11 +110,11 @@ class LiveCalibration:
         return self._fits is not None and self._fits.recording is not None
 
     def waits_for_imu(self) -> bool:
-        """Samples may come in batches."""
+        """False: a calibration does not need the samples in time."""
         return False
 
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
-        """Hand a message over; errors are those of `step`."""
+        """Hand a message over; its errors are returned by `step`."""
         configured = self._parameters.intrinsics.given
         if self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured):
             return None
@@ -114,7 +133,7 @@ class LiveCalibration:
         )
 
     def step(self, timeout: float = 0.0) -> Progress | Calibrated | RsRelposeError | None:
-        """Use a message; the state after a fit, the error of the message, or None."""
+        """Use a message; returns the state after a fit, the error of the message, or None."""
         outcome: Progress | Calibrated | RsRelposeError | None = None
         try:
             message = self._queue.get(timeout=timeout)
@@ -147,7 +166,7 @@ class LiveCalibration:
         return self._after_fit()
 
     def _use_clock_of(self, message: Any) -> None:
-        """Go on with a clock that was set back, as by a bag that is looped, or begin again."""
+        """Go on with a clock that was set back, as when a bag is looped, or begin again."""
         recorder = self._recorder
         self._refused = 0
         if not recorder.seconds or stamp_ns(message.header) > recorder.last_ns:
@@ -178,14 +197,13 @@ class LiveCalibration:
             self._fits = None
 
     def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
-        """The stored calibration of the camera, if there is one, or the error of its file."""
+        """Return the stored calibration of the camera, or the error of its file, or start."""
         config = self._parameters.calibration
         size = self._recorder.size
-        self._camera = (
-            CameraId(config.camera_name, *size)
-            if config.camera_name
-            else CameraId(frame_id, *size, self._topic)
-        )
+        if config.camera_name:
+            self._camera = CameraId(config.camera_name, *size)
+        else:
+            self._camera = CameraId(frame_id, *size, self._topic)
         try:
             path = stored.path_of(config, self._camera)
             if self._use_stored and path.is_file():
@@ -198,11 +216,11 @@ class LiveCalibration:
                 )
         except RsRelposeError as error:
             return error
-        self._fits = None if self.waits_for else _Fits()
+        if self.waits_for:
+            return Progress(f'waiting for {self.waits_for}')
+        self._fits = _Fits()
         return Progress(
             'calibrating: rotate the camera about all three axes, 20 to 60 deg/s, for some 20 s'
-            if not self.waits_for
-            else f'waiting for {self.waits_for}'
         )
 
     def _after_fit(self) -> Progress | Calibrated | None:
@@ -265,10 +283,11 @@ class LiveCalibration:
 
 
 class _Fits:
-    """Process that fits one recording after the other, with no share of the interpreter's lock.
+    """A process that fits one recording after the other, without the interpreter's lock.
 
-    Not by multiprocessing, which unblocks the signals of the calling thread. It imports and loads
-    its kernels while the first images are recorded; signals of the terminal are blocked in it.
+    It is not started by multiprocessing, which unblocks the signals of the calling thread. It
+    imports and loads its kernels while the first images are recorded, and it inherits the blocked
+    signals, so that an interrupt at the terminal reaches the node alone.
     """
 
     def __init__(self) -> None:
@@ -280,7 +299,7 @@ class _Fits:
         self._thread = ThreadPoolExecutor(1)
 
     def begin(self, recording: CalibrationInput, *others: Any) -> None:
-        """Fit a recording; `others`: configuration, and rotation of a transform."""
+        """Fit a recording; `others` are the configuration and the rotation of a transform."""
         self.recording = recording
         self.found = self._thread.submit(self._answer, (recording, *others))
 
@@ -289,7 +308,7 @@ class _Fits:
         answers = self.process.stdout
         assert requests is not None and answers is not None
         try:
-            pickle.dump(arguments, requests, protocol=5)  # without copies of the arrays
+            pickle.dump(arguments, requests, protocol=5)  # protocol 5 does not copy the arrays
             requests.flush()
             found: CalibrationResult | RsRelposeError = pickle.load(answers)  # noqa: S301
         except (OSError, EOFError, pickle.UnpicklingError):
@@ -303,7 +322,7 @@ class _Fits:
         self.process.wait()
         self._thread.shutdown()
         for pipe in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):  # the rest of a request
+            with suppress(OSError):  # the rest of a request cannot be written any more
                 pipe.close()  # type: ignore[union-attr]
 
 

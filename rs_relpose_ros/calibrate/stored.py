@@ -1,4 +1,4 @@
-"""The calibration of a node: how far it is, and the file that stores it with its camera."""
+"""The calibration of a node: its progress, and the file that stores it with its camera."""
 
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -15,8 +15,11 @@ from rs_relpose_ros.output_files import written
 from rs_relpose_ros.pipeline.findings import Code
 from rs_relpose_ros.pipeline.findings_text import with_sigma
 
-# Section of the file that identifies the camera; a node of another name ignores it.
+# Section of the file that identifies the camera; rclpy ignores it, as no node has this name.
+# [derived: interface of the file]
 _SECTION = 'rs_relpose_calibration'
+# Characters of a camera's name that its file name does not keep, such as slashes. [chosen: what is
+# legal in file names everywhere]
 _ILLEGAL = re.compile(r'[^\w.-]+')
 
 
@@ -24,7 +27,8 @@ _ILLEGAL = re.compile(r'[^\w.-]+')
 class CameraId:
     """Name and image size [px] of a camera.
 
-    `topic`: of its images, '' if the user has named it; another one with its name has another.
+    `topic` is the topic of its images, which distinguishes cameras of one name. It is '' if the
+    user has named the camera.
     """
 
     name: str
@@ -38,8 +42,8 @@ class Progress:
     """State of a calibration that goes on."""
 
     text: str
-    share: float = 0.0  # of the quantities that are known well enough
-    # Name -> value with sigma, and what is missing.
+    share: float = 0.0  # share of the quantities that are known well enough
+    # Each quantity's value with its sigma and what is missing, in words.
     values: dict[str, str] = field(default_factory=dict)
 
 
@@ -54,9 +58,9 @@ class Calibrated:
 
 
 def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
-    """File of a camera's calibration, where camera_info_manager has that of its CameraInfo.
+    """File of a camera's calibration, in the folder that camera_info_manager uses for CameraInfo.
 
-    InputError without a home directory.
+    InputError if there is no home directory.
     """
     if config.calibration_file:
         return Path(config.calibration_file).expanduser()
@@ -103,7 +107,7 @@ def save(path: Path, camera: CameraId, parameters: str, *, replace: bool = True)
 
 
 def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
-    """Parameters of a stored calibration by name, and its date with their sigmas in words.
+    """Read a stored calibration: its parameters by name, and in words its date and sigmas.
 
     InputError if the file is damaged, or of another camera or image size.
     """
@@ -127,12 +131,11 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
             f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
             f'for {camera.name!r} of {camera.width}x{camera.height}'
         )
-    known = [
-        f'{name.replace("_", " ")} '
-        + with_sigma(Code(name), values[name], values[f'{name}_sigma'])
-        for name in ('readout_time', 'time_offset')
-        if f'{name}_sigma' in values
-    ]
+    known = []
+    for name in ('readout_time', 'time_offset'):
+        if f'{name}_sigma' in values:
+            text = with_sigma(Code(name), values[name], values[f'{name}_sigma'])
+            known.append(f'{name.replace("_", " ")} {text}')
     if 'axes_sigma' in values:
         known.append(f'axes +- {math.degrees(values["axes_sigma"]):.2f} deg')
     return values, f'{own["date"]} ({", ".join(known)})'

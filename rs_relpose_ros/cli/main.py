@@ -14,9 +14,9 @@ from rs_relpose_ros.errors import library, MissingInputError, RsRelposeError
 
 PROGRAM = 'rs_relpose'
 
-# Name -> module (and its Command), one line of help. The module is imported only for its command:
-# the overview needs neither OpenCV nor Numba. Commands of the laboratory, another package, are
-# found by name, so that the product does not depend on it.
+# Each command's module (and its `Command` there), and one line of help. A module is imported only
+# for its command, so that the overview needs neither OpenCV nor Numba. Commands of the laboratory,
+# which is another package, are found by name, so that the product does not depend on it.
 COMMANDS: Mapping[str, tuple[str, str]] = {
     'batch': ('rs_relpose_ros.cli.batch', 'check, calibrate or replay over many bags, on Dask'),
     'benchmark': (
@@ -70,13 +70,14 @@ LABORATORY = (
     'the package rs_relpose_lab, which is not installed: '
     '"pip install \'rs_relpose_ros[lab]\'", or in a checkout "pip install ./rs_relpose_lab"'
 )
-DONE = 0
-FAILED = 1
-BAD_INPUT = 2
+# Exit codes besides 0, which scripts of users rely on. [derived: interface of the commands]
+FAILED = 1  # the work ran, and failed
+BAD_INPUT = 2  # bad usage or bad input: nothing ran
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 
-# Errors of an unusable path of the user.
+# Errors that mean an unusable path of the user. Another OSError, as of a full disk, is a failure.
+# [chosen: these errors name a file]
 _BAD_PATHS = (
     FileNotFoundError,
     FileExistsError,
@@ -89,7 +90,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Command(NamedTuple):
-    """A command; a module that is one has the same names. `run` returns the exit code."""
+    """A command; `run` returns the exit code. A module of one command has the same names."""
 
     HELP: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
@@ -113,7 +114,7 @@ def load_command(name: str) -> Command:
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:
-    """Return the parser of all commands, with the arguments of the `selected` one only."""
+    """Return the parser of all commands, with the arguments of the `selected` command only."""
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description='Relative poses of rolling-shutter images, aided by an IMU: offline tools.',
@@ -134,17 +135,17 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
             loaded = load_command(name)
             command.description = loaded.HELP
             loaded.add_arguments(command)
-            # Without a default of its own, so that an -v before the command is kept.
+            # This -v has no default, so that an -v before the command is kept.
             _add_verbose(command, default=argparse.SUPPRESS)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line `argv` (default: that of the process) and return its exit code."""
+    """Run a command line, by default the one of the process, and return its exit code."""
     use_one_blas_thread()
     try:
         code = _run(sys.argv[1:] if argv is None else list(argv))
-        # Raises here if the pipe is closed, not while the interpreter shuts down.
+        # If the pipe is closed, this raises here and not while the interpreter shuts down.
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -156,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     """Parse and run; errors in the input become one line and exit code 2."""
-    # No option of the top parser has a value, so the first plain word is the command.
+    # The options before the command have no values, so the first plain word is the command.
     selected = next((word for word in arguments if not word.startswith('-')), None)
     try:
         args = make_parser(selected).parse_args(arguments)
@@ -165,7 +166,7 @@ def _run(arguments: list[str]) -> int:
     except SystemExit as end:  # argparse has printed the error or the help
         return end.code if isinstance(end.code, int) else BAD_INPUT
     logging.basicConfig(level=logging.WARNING, format='%(levelname)s %(name)s: %(message)s')
-    # Numba and Matplotlib would fill pages at level DEBUG.
+    # At level DEBUG, Numba and Matplotlib would fill pages: only our packages get the level.
     for package in ('rs_relpose_ros', 'rs_relpose_lab'):
         logging.getLogger(package).setLevel(
             {0: logging.WARNING, 1: logging.INFO}.get(args.verbose, logging.DEBUG)

@@ -1,4 +1,4 @@
-"""Common parts of the commands: options, progress bar, version, a run over a bag."""
+"""What the commands share: options, progress bar, version, and a run over a bag."""
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping
@@ -27,15 +27,16 @@ from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE, written
 
 _logger = logging.getLogger(__name__)
 
-# Results of a bag; `metrics`: content of summary.json without provenance.
+# What a run over a bag makes. Its attribute `metrics` is the content of summary.json without the
+# provenance.
 Made = TypeVar('Made', bound=Any)
-# Called with a folder, a bag, its topics, and the parameters.
+# The work of a run: it gets the folder of the results, a bag, its topics, and the parameters.
 Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
 
-
-# Arguments by name, as of `ArgumentParser.add_argument`.
+# Arguments of a command by name, with what `ArgumentParser.add_argument` takes.
 Arguments = Mapping[str, Mapping[str, Any]]
 
+# The bag that a command reads.
 BAG: Arguments = {
     'bag': {
         'metavar': 'BAG',
@@ -43,6 +44,7 @@ BAG: Arguments = {
         'help': 'rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file',
     }
 }
+# The parameters of the node.
 PARAMETERS: Arguments = {
     '--params': {
         'metavar': 'FILE',
@@ -56,7 +58,7 @@ PARAMETERS: Arguments = {
         'help': 'set a parameter, after --params; may be repeated',
     },
 }
-# Of each field of `SensorTopics`; in a group of their own.
+# A topic for each field of `SensorTopics`; the help shows them as a group of their own.
 TOPICS: Arguments = {
     f'--{role}-topic': {'metavar': 'TOPIC', 'default': '', 'help': text}
     for role, text in {
@@ -67,11 +69,12 @@ TOPICS: Arguments = {
         'truth': 'PoseStamped: ground truth of the camera',
     }.items()
 }
+# The topics of a command that has no use for the ground truth.
 SENSOR_TOPICS = {name: values for name, values in TOPICS.items() if name != '--truth-topic'}
 
 
 def out(suffix: str) -> Arguments:
-    """--out, which is BAGNAME_`suffix` by default."""
+    """Make the option --out, which is BAGNAME_`suffix` by default."""
     return {
         '--out': {
             'metavar': 'DIR',
@@ -83,21 +86,23 @@ def out(suffix: str) -> Arguments:
 
 
 def of_run(suffix: str) -> Arguments:
-    """Those of `run_on_bag`."""
+    """Collect the arguments that `run_on_bag` uses."""
     return {**BAG, **PARAMETERS, **out(suffix), **TOPICS}
 
 
 def declared(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
-    """A function that declares arguments."""
+    """Make a function that declares arguments."""
 
     def add(parser: argparse.ArgumentParser) -> None:
-        topics = None
+        group = None
         for name, values in arguments.items():
-            if name in TOPICS:
-                topics = topics or parser.add_argument_group(
-                    'topics', 'found by type where that is unambiguous'
-                )
-            (topics if name in TOPICS and topics else parser).add_argument(name, **values)
+            if name not in TOPICS:
+                parser.add_argument(name, **values)
+                continue
+            group = group or parser.add_argument_group(
+                'topics', 'found by type where that is unambiguous'
+            )
+            group.add_argument(name, **values)
 
     return add
 
@@ -108,7 +113,10 @@ def run_on_bag(
     work: Work[Made],
     calibration: Mapping[str, Any] | None = None,
 ) -> tuple[Path, Made]:
-    """Run `work` and write summary.json; `calibration`: parameters where `args` give no others."""
+    """Run `work` and write summary.json; returns the folder and what the work made.
+
+    `calibration` has parameters that hold where `args` give no others.
+    """
     parameters = read_parameters(args.params, args.set)
     parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
     folder = out_folder(args, suffix)
@@ -137,7 +145,7 @@ def run_on_bag(
 
 
 def out_folder(args: argparse.Namespace, suffix: str) -> Path:
-    """Folder of the results, of the option `out`."""
+    """Folder of the results: the option `out`, or its default."""
     return args.out or Path(f'{bag_name(args.bag)}_{suffix}')
 
 
@@ -148,7 +156,7 @@ def warn_unused(reasons: Mapping[str, int], what: str = 'not used') -> None:
 
 
 def topic_options(args: argparse.Namespace) -> dict[str, str]:
-    """Names by role, of the options `TOPICS`."""
+    """Names of topics by role, from the options `TOPICS`."""
     return {
         name.removesuffix('_topic'): value
         for name, value in vars(args).items()
@@ -160,9 +168,9 @@ def topic_options(args: argparse.Namespace) -> dict[str, str]:
 def opened(
     args: argparse.Namespace, parameters: Parameters
 ) -> Iterator[tuple[Bag, SensorTopics, Parameters]]:
-    """A bag and its topics, and `parameters` with the extrinsics of its transforms.
+    """Open a bag: the bag, its topics, and `parameters` with the extrinsics of its transforms.
 
-    A progress bar shows its images. `args` have `bag` and the options of topics and parameters.
+    `args` have `bag` and the options of topics and parameters. A progress bar counts the images.
     """
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(
@@ -172,12 +180,10 @@ def opened(
         if contradiction:
             _logger.warning('%s', contradiction)
         neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
-        need_sensor_parameters(
-            parameters,
-            f'use --params {neighbour}, the file next to the bag'
-            if args.params is None and neighbour.is_file()
-            else '',
-        )
+        hint = ''
+        if args.params is None and neighbour.is_file():
+            hint = f'use --params {neighbour}, the file next to the bag'
+        need_sensor_parameters(parameters, hint)
         with image_progress(bag, topics.image, bag_name(args.bag)):
             yield bag, topics, parameters
 
@@ -196,7 +202,7 @@ def progress_bar(total: int, unit: str, description: str | None = None) -> tqdm:
 
 
 def image_progress(bag: Bag, image: Topic, description: str) -> tqdm:
-    """A progress bar over the images of a bag, as they are read."""
+    """Return a progress bar over the images of a bag, which moves as they are read."""
     bar = progress_bar(image.count, 'image', description)
     bag.on_message = lambda topic: bar.update(topic == image.name)
     return bar

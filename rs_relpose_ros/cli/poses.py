@@ -21,34 +21,34 @@ from rs_relpose_ros.offline import replay
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import beside, refuse_existing, refuse_unwritable, SUMMARY_FILE
 
+# Name of the export format that has poses alone. [derived: interface]
 TUM = 'tum'
 
+# Reasons for missing poses that are printed; a longer list would hide the lines after it.
+# [chosen: any value in 3..10 would do]
 _MOST_REASONS = 5
 
 _logger = logging.getLogger(__name__)
 
 
 def replay_bag(args: argparse.Namespace) -> tuple[Path, replay.ReplayOutcome]:
-    """Replay and write the files of the command, into the folder that is returned."""
+    """Replay, and write the files of the command into the folder that is returned."""
     stamps = None if args.stamps is None else replay.read_stamps(args.stamps)
-    return options.run_on_bag(
-        args,
-        'relpose',
-        lambda folder, bag, topics, parameters: replay.replay_into(
-            folder,
-            bag,
-            topics,
-            parameters,
-            stamps=stamps,
-            pictures=not args.no_pictures,
-            with_bag=args.with_bag,
-        ),
-        _calibration(args) if args.calibrate else {},
+    work = partial(
+        replay.replay_into,
+        stamps=stamps,
+        pictures=not args.no_pictures,
+        with_bag=args.with_bag,
     )
+    calibration = _calibration(args) if args.calibrate else {}
+    return options.run_on_bag(args, 'relpose', work, calibration)
 
 
 def _calibration(args: argparse.Namespace) -> dict[str, Any]:
-    """Calibrate from the bag of `args`; the parameters. InputError if one is not determined."""
+    """Calibrate from the bag of `args`; returns the parameters.
+
+    InputError if the bag does not determine one of them.
+    """
     from rs_relpose_ros.cli.recordings import calibrate_bag, CALIBRATION_FILE
 
     folder = options.out_folder(args, 'relpose') / 'calibration'
@@ -78,19 +78,15 @@ def _print_replay(outcome: replay.ReplayOutcome) -> None:
     pairs = metrics['pairs']
     frames = metrics['frames']
     refused = sum(frames['refused'].values()) + frames['failed']
-    print(
-        f'{frames["processed"]} of {frames["in_bag"]} images processed'
-        + (f', {refused} refused' if refused else '')
-        + f' ({_text(metrics["timing"]["processing_per_frame_ms"], "ms per image")})'
+    without = f', {refused} refused' if refused else ''
+    time = _text(metrics['timing']['processing_per_frame_ms'], 'ms per image')
+    print(f'{frames["processed"]} of {frames["in_bag"]} images processed{without} ({time})')
+    by_status = ''.join(
+        f', {count} {status}'
+        for status, count in pairs['by_status'].items()
+        if count and status != 'OK'
     )
-    print(
-        f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
-        + ''.join(
-            f', {count} {status}'
-            for status, count in pairs['by_status'].items()
-            if count and status != 'OK'
-        )
-    )
+    print(f'{pairs["total"]} pairs, {pairs["answered"]} with a pose{by_status}')
     if not pairs['total']:
         print(
             'no keyframe pair: the bag is shorter than a keyframe interval, or too few frames '
@@ -98,36 +94,31 @@ def _print_replay(outcome: replay.ReplayOutcome) -> None:
         )
     elif not pairs['answered']:
         # The reason of suppressed poses follows with the findings.
-        reasons = sorted(
-            {
-                record.pose.reason
-                for record in outcome.records
-                if record.pose.status.value != 'WITHHELD'
-            }
-        )
-        for reason in reasons[:_MOST_REASONS]:
+        poses = [record.pose for record in outcome.records]
+        reasons = {pose.reason for pose in poses if pose.status.value != 'WITHHELD'}
+        for reason in sorted(reasons)[:_MOST_REASONS]:
             print(f'no pose: {reason}')
     _print_errors(metrics['errors_against_truth'])
     if pairs['answered']:
-        medians = metrics['medians']
-        print(
-            f'medians: {_text(medians["inliers"], "inliers")}, residual '
-            f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
-            f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}'
-        )
-        known = metrics['baselines']['known']
-        print(
-            f'baseline in metres: of {known} of {pairs["answered"]} poses'
-            + (
-                f', with a median sigma of '
-                f'{100.0 * metrics["baselines"]["log_sigma_median"]:.0f} %'
-                if known
-                else ''
-            )
-        )
-        for reason, count in metrics['baselines']['not_known'].items():
-            print(f'{reason} ({count} poses)')
+        _print_medians(metrics)
     print(*outcome.health_lines(), sep='\n')
+
+
+def _print_medians(metrics: Mapping[str, Any]) -> None:
+    medians = metrics['medians']
+    print(
+        f'medians: {_text(medians["inliers"], "inliers")}, residual '
+        f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
+        f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}'
+    )
+    baselines = metrics['baselines']
+    known = baselines['known']
+    text = f'baseline in metres: of {known} of {metrics["pairs"]["answered"]} poses'
+    if known:
+        text += f', with a median sigma of {100.0 * baselines["log_sigma_median"]:.0f} %'
+    print(text)
+    for reason, count in baselines['not_known'].items():
+        print(f'{reason} ({count} poses)')
 
 
 def _print_errors(errors: Mapping[str, float] | None) -> None:
@@ -144,6 +135,7 @@ def _text(value: Any, unit: str) -> str:
     return f'no {unit}' if value is None else f'{value:.3g} {unit}'
 
 
+# The commands of this module. [derived: `cli.main.COMMANDS`]
 REPLAY = Command(
     'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
     '1) with the pipeline of relpose_node. Topics are found by type where that is unambiguous. '
@@ -158,10 +150,9 @@ REPLAY = Command(
             '--stamps': {
                 'metavar': 'FILE',
                 'type': Path,
-                'help': 'use only the frames whose stamps [ns] are '
-                'in FILE, one per line, as the parameter stamps_file of a live node wrote them: '
-                'the '
-                'poses are then equal to its poses, bit by bit',
+                'help': 'use only the frames whose stamps [ns] are in FILE, one per line, as the '
+                'parameter stamps_file of a live node wrote them: the poses are then equal to its '
+                'poses, bit by bit',
             },
             '--calibrate': {
                 'action': 'store_true',
@@ -231,7 +222,7 @@ PAIRS = Command(
 
 
 def rate_in_hertz(text: str) -> float:
-    """Type of an option."""
+    """Convert the text of an option."""
     rate = float(text)
     if not 1e-3 <= rate <= 1e5:
         raise argparse.ArgumentTypeError(f'must be from 0.001 to 100000 Hz, got {text}')
@@ -239,7 +230,7 @@ def rate_in_hertz(text: str) -> float:
 
 
 def _odometry_of(args: argparse.Namespace, **how: Any) -> tuple[Path, Any]:
-    """Folder and outcome of the odometry; prints its warnings, and why it did not start."""
+    """Run the odometry; prints its warnings, and why it did not start."""
     need_gtsam()
     from rs_relpose_ros.odometry.offline import odometry_into
 
@@ -405,10 +396,8 @@ EXPORT = Command(
                 'metavar': 'HZ',
                 'type': rate_in_hertz,
                 'default': 0.0,
-                'help': 'images, at most so '
-                'many a second, or poses (tum); default: those of the keyframes, in which points '
-                'are '
-                'observed',
+                'help': 'images, at most so many a second, or poses (tum); default: those of the '
+                'keyframes, in which points are observed',
             },
             '--images': {
                 'choices': export.IMAGE_CHOICES,

@@ -22,12 +22,14 @@ from rs_relpose_ros.config.files import read_parameters, write_parameters
 from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
-from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
+from rs_relpose_ros.messages.transforms import bag_frames, BagFrames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, refuse_unwritable, written
 
+# File of the calibrated parameters, in the folder of the results. [derived: interface]
 CALIBRATION_FILE = 'calibration.yaml'
+# All files of the command `calibrate`. [derived: interface]
 _CALIBRATION_FILES = (CALIBRATION_FILE, 'calibration.json', 'cost_over_readout.png')
 
 _logger = logging.getLogger(__name__)
@@ -37,23 +39,7 @@ def calibrate_bag(
     args: argparse.Namespace,
 ) -> tuple[calibration.CalibrationResult, RollingShutterCamera]:
     """Calibrate and write the files of the command."""
-    try:
-        tracking = settings.TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
-        config = replace(
-            settings.TRACKED_IN_IMAGES,
-            max_time_offset=args.max_offset,
-            exposure_time=args.exposure_time,
-            exposure_margin=args.exposure_margin,
-        )
-    except InputError as error:  # names the settings: replaced by the options
-        text = str(error)
-        for name, option in (
-            ('feature_rows', '--rows'),
-            ('max_time_offset', '--max-offset'),
-            ('exposure_', '--exposure-'),
-        ):
-            text = text.replace(name, option)
-        raise InputError(text) from None
+    tracking, config = _calibration_settings(args)
     folder = options.out_folder(args, 'calibration')
     refuse_unwritable(folder)
     with open_bag(args.bag) as bag:
@@ -61,7 +47,6 @@ def calibrate_bag(
         with options.image_progress(bag, topics.image, 'tracking'):
             recording = read_recording(bag, topics, tracking)
         frames = bag_frames(bag, topics)
-        placed = frames.imu_in_camera
     if args.lens is not None:
         recording = recording.with_unknown_lens(args.lens)
     first, last = args.rows
@@ -74,24 +59,9 @@ def calibrate_bag(
     with options.progress_bar(100, '%', 'fitting') as bar:
         result = recording.calibrated(
             config,
-            quat_prior=placed and placed[3:],
+            quat_prior=frames.imu_in_camera and frames.imu_in_camera[3:],
             progress=lambda share: bar.update(round(100 * share) - bar.n),
         )
-    values: dict[str, Any] = {}
-    if placed is not None:
-        values, contradiction = extrinsics(
-            settings.Parameters.from_mapping(
-                {
-                    'quat_cam_imu_xyzw': result.quat_cam_imu_xyzw,
-                    'axes_sigma': min(result.rotation.sigma, 1.0),
-                }
-            ),
-            placed,
-            frames.camera,
-            frames.imu,
-        )
-        if contradiction:
-            _logger.warning('%s', contradiction)
     prepare_folder(folder, _CALIBRATION_FILES)
     text = calibration.parameter_file(
         result,
@@ -99,15 +69,50 @@ def calibrate_bag(
         camera=recording.camera,
         compressed=topics.image.msgtype == COMPRESSED_IMAGE,
         feature_rows=tuple(args.rows),
-        placed=values,
+        placed=_extrinsics(result, frames),
     )
-    parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
     mapping = calibration.as_mapping(result, recording.camera)
+    parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
     for path, content in ((parameters, text), (metrics, json.dumps(mapping, indent=1) + '\n')):
         with written(path) as file:
             file.write(content)
     calibration.draw_curve(result, curve)
     return result, recording.camera
+
+
+def _calibration_settings(
+    args: argparse.Namespace,
+) -> tuple[settings.TrackingConfig, settings.CalibrationConfig]:
+    """Settings from the options; an InputError names the option in place of the setting."""
+    try:
+        tracking = settings.TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
+        config = replace(
+            settings.TRACKED_IN_IMAGES,
+            max_time_offset=args.max_offset,
+            exposure_time=args.exposure_time,
+            exposure_margin=args.exposure_margin,
+        )
+    except InputError as error:
+        text = str(error).replace('feature_rows', '--rows')
+        text = text.replace('max_time_offset', '--max-offset')
+        raise InputError(text.replace('exposure_', '--exposure-')) from None
+    return tracking, config
+
+
+def _extrinsics(result: calibration.CalibrationResult, frames: BagFrames) -> dict[str, Any]:
+    """Parameters from the transforms of a bag; a contradiction to the result is logged."""
+    if frames.imu_in_camera is None:
+        return {}
+    calibrated = settings.Parameters.from_mapping(
+        {
+            'quat_cam_imu_xyzw': result.quat_cam_imu_xyzw,
+            'axes_sigma': min(result.rotation.sigma, 1.0),
+        }
+    )
+    values, contradiction = extrinsics(calibrated, frames.imu_in_camera, frames.camera, frames.imu)
+    if contradiction:
+        _logger.warning('%s', contradiction)
+    return values
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -118,6 +123,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     return 0 if result.complete else FAILED
 
 
+# The commands of this module. [derived: `cli.main.COMMANDS`]
 CALIBRATE = Command(
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
     'without a target: readout time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
@@ -137,8 +143,7 @@ CALIBRATE = Command(
                 'nargs': 2,
                 'default': (0.0, 0.0),
                 'help': 'use only these image rows, such as those above a dashboard that moves '
-                'with '
-                'the camera',
+                'with the camera',
             },
             '--detector': {
                 'choices': tuple(settings.TRACKERS),
@@ -226,21 +231,26 @@ CHECK = Command(
 
 
 class Source(NamedTuple):
-    """A format of recordings."""
+    """A format of recordings that `convert` reads."""
 
     help: str
     path: str  # 'FILE' or 'FOLDER'
-    read: Callable[[Path, Path | None], Recording]  # path, lens profile
+    read: Callable[[Path, Path | None], Recording]  # reads a path, with a lens profile
     has_lens_profile: bool = False
 
 
 def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
-    """A reader of another package, found by name: the product does not depend on it."""
-    return lambda folder, _: getattr(
-        library('rs_relpose_lab.datasets', f'public recordings need {LABORATORY}'), reader
-    )(folder)
+    """Find a reader of the laboratory by name, so that the product does not depend on it."""
+
+    def read(folder: Path, _: Path | None) -> Recording:
+        datasets = library('rs_relpose_lab.datasets', f'public recordings need {LABORATORY}')
+        recording: Recording = getattr(datasets, reader)(folder)
+        return recording
+
+    return read
 
 
+# Formats of recordings by the name that the user types. [derived: interface]
 SOURCES: Mapping[str, Source] = {
     'video': Source(
         'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
@@ -305,10 +315,10 @@ def _convert(args: argparse.Namespace) -> int:
     write_parameters(parameters, recording.title, recording.parameters)
     size = sum(file.stat().st_size for file in args.out_bag.iterdir())
     samples = len(recording.cropped(recording.imu)) + len(recording.cropped(recording.accel))
+    poses = f', {len(recording.truth)} true poses' if recording.truth else ''
     print(
-        f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples'
-        + (f', {len(recording.truth)} true poses' if recording.truth else '')
-        + f', {size / 1e6:.1f} MB; parameters of the node: {parameters}'
+        f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples{poses}, '
+        f'{size / 1e6:.1f} MB; parameters of the node: {parameters}'
     )
     if 'readout_time' not in {value.name for value in recording.parameters}:
         print(f'the readout time is unknown: rs_relpose calibrate {args.out_bag}')
@@ -337,9 +347,9 @@ def _unroll(args: argparse.Namespace) -> int:
         _logger.warning('%s', line)
     options.warn_unused(report.reasons.most_common(), 'omitted')
     omitted = report.images_in_bag - report.images
-    text = f'{report.images} of {report.images_in_bag} images derotated' + (
-        f', {omitted} omitted' if omitted else ''
-    )
+    text = f'{report.images} of {report.images_in_bag} images derotated'
+    if omitted:
+        text += f', {omitted} omitted'
     if not report.images:
         print(f'{text}; nothing was written')
         return FAILED

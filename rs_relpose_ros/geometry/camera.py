@@ -1,7 +1,7 @@
 """The rolling-shutter camera: pixel <-> unit ray, derivatives by the lens, and the time of a row.
 
-Camera frame: x right, y down, z forward. The row time is that of the **raw, distorted** row: the
-point is undistorted, its row is not.
+In the camera frame x points right, y down, z forward. The row time is the time of the **raw,
+distorted** row: the point is undistorted, its row is not.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,11 +25,16 @@ from rs_relpose_ros.geometry.lens import (
     undistort_points,
 )
 
+# Names of the row from which row times count. [derived: definition of the parameter stamp_row]
 REFERENCE_ROWS = ('first', 'middle', 'last')
+# Names of the direction in which rows are read. [derived: definition of the parameter]
 READOUT_DIRECTIONS = ('down', 'up')
 
-# [px], far beyond any camera; squares of pixels and rays cannot overflow.
+# Largest width and height of an image [px]: squares of pixels cannot overflow. [chosen: any value
+# beyond the largest sensors, 1e5 px, would do]
 _LARGEST_IMAGE = 1_000_000
+# Largest focal length and distance of the principal point [px]: squares of rays cannot overflow.
+# [chosen: any value in 1e7..1e100 would do]
 _FARTHEST_PIXEL = 1e9
 
 
@@ -44,16 +49,16 @@ class RollingShutterCamera:
     fx, fy, cx, cy : float
         Pinhole intrinsics [px]; pixel centres at integer coordinates, as in OpenCV.
     distortion_model : {'plumb_bob', 'rational_polynomial', 'equidistant'}
-        A name of `DISTORTION_MODELS`, as in sensor_msgs/CameraInfo (REP-104); ``'equidistant'`` is
-        OpenCV's fisheye model.
+        A name of `geometry.lens.DISTORTION_MODELS`, as in sensor_msgs/CameraInfo (REP-104);
+        ``'equidistant'`` is OpenCV's fisheye model.
     distortion : sequence of float
-        Coefficients in OpenCV's order; empty for none.
+        Coefficients in OpenCV's order; empty for no distortion.
     readout_time : float
         `height` times the line delay [s]; 0 is a global shutter. It has no default.
     readout_direction : {'down', 'up'}
         Whether row 0 is read first ('down') or last ('up').
     reference_row : {'first', 'middle', 'last'}
-        The row from which row times count (rows 0, (height-1)/2, height-1): motion refers to it,
+        The row from which row times count (row 0, (height-1)/2 or height-1). Motion refers to it,
         and a relative pose relates the reference rows of its two frames.
     """
 
@@ -133,7 +138,7 @@ class RollingShutterCamera:
     def project(self, points: ArrayLike) -> Array:
         """Raw pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera.
 
-        At one time: the motion during the readout is not modelled.
+        All points are projected at one time: the motion during the readout is not modelled.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         normalized = project_points(points, self._compiled)
@@ -142,8 +147,8 @@ class RollingShutterCamera:
     def project_rotating(self, rays: Array, rows: Array, rotations: Array) -> Array:
         """Raw pixels (N, 2) of rays (N, 3) while the camera rotates; NaN where there is none.
 
-        `rows` (N,): first guesses. `rotations` (K, 3, 3): from the frame of the rays to that of
-        the camera, at K rows spread evenly from the first to the last one.
+        `rows` (N,) are first guesses. `rotations` (K, 3, 3) rotate the rays into the frame of the
+        camera at K rows, which are spread evenly from the first to the last row.
         """
         return project_rotating(
             rays,
@@ -218,13 +223,13 @@ class Intrinsics:
     """Intrinsics of the full sensor, and which part of it is published at which binning.
 
     A published pixel ``u`` covers `binning_x` sensor columns, and pixel centres lie at integer
-    coordinates, so ``u_sensor = x_offset + binning_x (u + 1/2) - 1/2``; the same for ``v``.
-    No message has the readout time, so it is not included.
+    coordinates, so ``u_sensor = x_offset + binning_x (u + 1/2) - 1/2``; the same holds for ``v``.
+    The readout time is not included, because no message has it.
 
     Parameters
     ----------
     width, height, fx, fy, cx, cy, distortion_model, distortion
-        Of the full sensor, as in `RollingShutterCamera`.
+        Size and lens of the full sensor, as in `RollingShutterCamera`.
     x_offset, y_offset : int
         Sensor pixel of the published image's corner.
     binning_x, binning_y : int
@@ -278,17 +283,12 @@ class Intrinsics:
 
     def to_sensor(self, points: ArrayLike) -> Array:
         """Sensor pixels (N, 2) of pixels (N, 2) of the published image."""
-        points = np.asarray(points, dtype=np.float64)
-        return (
-            (points + 0.5) * (self.binning_x, self.binning_y)
-            + (self.x_offset, self.y_offset)
-            - 0.5
-        )
+        corner = (self.x_offset, self.y_offset)
+        binning = (self.binning_x, self.binning_y)
+        return (np.asarray(points, dtype=np.float64) + 0.5) * binning + corner - 0.5
 
     def to_image(self, points: ArrayLike) -> Array:
         """Pixels (N, 2) of the published image of sensor pixels (N, 2)."""
-        points = np.asarray(points, dtype=np.float64)
-        return (points + 0.5 - (self.x_offset, self.y_offset)) / (
-            self.binning_x,
-            self.binning_y,
-        ) - 0.5
+        corner = (self.x_offset, self.y_offset)
+        binning = (self.binning_x, self.binning_y)
+        return (np.asarray(points, dtype=np.float64) + 0.5 - corner) / binning - 0.5

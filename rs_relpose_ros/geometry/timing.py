@@ -2,8 +2,8 @@
 
     t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift + (v - v_stamp) line_delay
 
-as in docs/time_and_frames.md, "Rows and the IMU's clock"; T is the interval between frames
-(`FrameIntervals`), k ``time_offset_per_interval``.
+as in docs/time_and_frames.md, "Rows and the IMU's clock". T is the interval between frames
+(`FrameIntervals`), and k is the parameter ``time_offset_per_interval``.
 """
 
 from dataclasses import dataclass
@@ -15,13 +15,28 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 
+# Nanoseconds in a second. [derived: definition]
 NANOSECONDS = 1_000_000_000
 
-STAMP_EXPOSURES = ('start', 'middle', 'end')
+# Share of the exposure of the stamped row from the time that the stamp marks to the middle of this
+# exposure. [derived: definition of the parameter stamp_exposure]
+_TO_MIDDLE = {'start': 0.5, 'middle': 0.0, 'end': -0.5}
+# Names of what a stamp may mark. [derived: definition of the parameter stamp_exposure]
+STAMP_EXPOSURES = tuple(_TO_MIDDLE)
+
+# Difference of stamps [s] that no delay of a message explains: below it, two clocks count as one.
+# A smaller value would report slow transport as another clock, a larger value would wait for data
+# of a clock that is seconds off. [chosen: any value in 0.5..5 would do]
+_APART = 1.0
+
+# A step between images has an image missing if it is longer than so many median steps. Near 1,
+# jitter would count as a loss; from 2 on, one lost image would not. [chosen: any value in 1.5..1.9
+# would do]
+MISSING = 1.8
 
 
 def seconds_between(start_ns: int, end_ns: int) -> float:
-    """Float seconds from `start_ns` to `end_ns`: subtracted as integers, then converted."""
+    """Float seconds from `start_ns` to `end_ns`; the integers are subtracted before conversion."""
     return (end_ns - start_ns) / NANOSECONDS
 
 
@@ -30,37 +45,24 @@ def to_nanoseconds(seconds: float) -> int:
     return round(seconds * NANOSECONDS)
 
 
-# Difference of stamps [s] that no delay of a message explains.
-_APART = 1.0
-
-
 def clocks_apart(ahead: float) -> str:
-    """Message on stamps of the IMU that are `ahead` [s] of the images'; empty if by little."""
-    return (
-        ''
-        if abs(ahead) < _APART
-        else (
-            f'the clock of the IMU is {abs(ahead):.1f} s '
-            f'{"ahead of" if ahead > 0.0 else "behind"} '
-            "the images'"
-        )
-    )
-
-
-# Steps of so many medians have an image missing.
-MISSING = 1.8
+    """Message on stamps of the IMU that are `ahead` [s] of the images'; '' for one clock."""
+    if abs(ahead) < _APART:
+        return ''
+    side = 'ahead of' if ahead > 0.0 else 'behind'
+    return f"the clock of the IMU is {abs(ahead):.1f} s {side} the images'"
 
 
 def correlation_of_steps(steps: Array) -> float:
-    """Correlation of successive steps between images, with none missing between.
+    """Correlation of successive steps between images that have no image missing between them.
 
-    `steps` (N,): as shares of their median. About 1 of an exposure that changes, -0.5 of stamps
-    that jitter: a late one makes one step longer and the next one shorter.
+    `steps` (N,) are shares of their median. The correlation is about 1 if the exposure changes. It
+    is -0.5 if stamps jitter, because a late stamp makes one step longer and the next one shorter.
     """
     whole = (steps > 0.0) & (steps < MISSING)
     if not whole.any():
         return 0.0
-    # A few frames, as those after the start of a camera, must not decide.
+    # The few odd steps after the start of a camera must not decide.
     low, high = np.quantile(steps[whole], (0.05, 0.95))
     deviations = np.clip(steps, low, high)
     deviations -= deviations[whole].mean()
@@ -71,28 +73,31 @@ def correlation_of_steps(steps: Array) -> float:
 
 
 def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
-    """From the stamp to the middle of the stamped row's exposure [s]; of `STAMP_EXPOSURES`."""
-    return {'start': 0.5, 'middle': 0.0, 'end': -0.5}[stamp_exposure] * exposure_time
+    """Time from the stamp to the middle of the stamped row's exposure [s]."""
+    return _TO_MIDDLE[stamp_exposure] * exposure_time
 
 
 @dataclass(frozen=True, slots=True)
 class ImageClock:
     """Times of an image's rows on the IMU clock."""
 
-    camera: RollingShutterCamera  # its reference row is the one that the driver stamps
-    time_offset: float = 0.0  # [s] IMU clock minus camera clock
-    stamp_exposure: str = 'middle'  # time of that row's exposure which the stamp marks
-    exposure_time: float = 0.0  # [s] of one row
+    camera: RollingShutterCamera  # its reference row is the row that the driver stamps
+    time_offset: float = 0.0  # IMU clock minus camera clock [s]
+    stamp_exposure: str = 'middle'  # the time of the row's exposure that the stamp marks
+    exposure_time: float = 0.0  # exposure of one row [s]
     offset_per_interval: float = 0.0  # k [s/s]
     reference_interval: float = 0.0  # T_ref [s]
-    exposure_margin: float = 0.0  # [s]; if not 0, the exposure is T less this
+    exposure_margin: float = 0.0  # if not 0, the exposure is T less this [s]
 
     def __post_init__(self) -> None:
         validate.choice('stamp_exposure', self.stamp_exposure, STAMP_EXPOSURES)
         validate.number('exposure_time', self.exposure_time, 0.0, unit='s')
 
     def reference_ns(self, stamp_ns: int, interval_ns: int | None = None) -> int:
-        """Time [ns] of the reference row's mid-exposure; T of the frame is T_ref if not known."""
+        """Time of the reference row's mid-exposure [ns].
+
+        `interval_ns` is T of the frame, and None if it is not known: T_ref is used then.
+        """
         offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure(interval_ns))
         if interval_ns is not None:
             offset += self.offset_per_interval * (
@@ -101,14 +106,14 @@ class ImageClock:
         return stamp_ns + to_nanoseconds(offset)
 
     def exposure(self, interval_ns: int | None = None) -> float:
-        """Exposure of a row [s] of a frame of interval T, or T_ref if that is not known."""
+        """Exposure of a row [s] of a frame with the interval T, or T_ref if T is not known."""
         if not self.exposure_margin:
             return self.exposure_time
         interval = self.reference_interval if interval_ns is None else interval_ns / NANOSECONDS
         return max(interval - self.exposure_margin, 0.0)
 
     def exposed_span_ns(self, stamp_ns: int, interval_ns: int | None = None) -> tuple[int, int]:
-        """Times at which the first row's exposure begins and the last one's ends [ns]."""
+        """Times [ns]: begin of the first row's exposure, and end of the last row's exposure."""
         reference = self.reference_ns(stamp_ns, interval_ns)
         earliest, latest = self.camera.row_time_span
         half = to_nanoseconds(0.5 * self.exposure(interval_ns))
@@ -124,10 +129,10 @@ class Sensor(NamedTuple):
     `config.settings.sensor_model` builds it for a parameter set.
     """
 
-    camera: RollingShutterCamera  # its reference row is the one that poses relate
+    camera: RollingShutterCamera  # its reference row is the row that poses relate
     intrinsics: Intrinsics
-    clock: ImageClock  # of that row
-    pose_row_delay: float = 0.0  # [s] from the stamped row to it
+    clock: ImageClock
+    pose_row_delay: float = 0.0  # time from the stamped row to the row of the poses [s]
 
     def derotated(self, points: Array, motion: FrameMotion) -> tuple[Array, Array]:
         """Rays (N, 3) of pixels (N, 2) of a published image, and their row times (N,) [s]."""
@@ -138,8 +143,8 @@ class Sensor(NamedTuple):
     def project(self, rays: Array, row_times: Array, motion: FrameMotion) -> Array:
         """Pixels (N, 2) of a published image where rays (N, 3) are observed; NaN outside of it.
 
-        The inverse of `derotated`. The row of a ray depends on its pixel, so `row_times` (N,) are
-        a first guess that is improved twice.
+        This is the inverse of `derotated`. The row of a ray depends on its pixel, so `row_times`
+        (N,) are a first guess that is improved twice.
         """
         camera = self.camera
         first, last = camera.row_time_span
@@ -153,10 +158,10 @@ class Sensor(NamedTuple):
 
 
 class FrameIntervals:
-    """Interval T of each frame to the previous one; stamps that do not increase are ignored.
+    """Interval T of each frame to the frame before it; stamps that do not increase are ignored.
 
-    T is kept if frames are missing in between: the difference of the stamps exceeds 1.5 T. Two
-    such differences in a row that agree to a tenth are a new frame rate.
+    If frames are missing in between, so that the difference of the stamps exceeds 1.5 T, T stays.
+    Two such differences in a row that agree to a tenth are a new frame rate.
     """
 
     def __init__(self) -> None:
@@ -165,20 +170,16 @@ class FrameIntervals:
         self._interval_ns: int | None = None
 
     def add(self, stamp_ns: int) -> int | None:
-        """T of the frame of this stamp [ns]; None of the first one."""
-        if self._stamp_ns is not None:
-            difference = stamp_ns - self._stamp_ns
-            kept = self._interval_ns
-            if difference <= 0:
-                return kept
-            # 2 d > 3 T and |d - d_before| > d / 10, in integers.
-            missing = (
-                kept is not None
-                and 2 * difference > 3 * kept
-                and 10 * abs(difference - self._difference_ns) > difference
-            )
-            if not missing:
+        """Interval T of the frame with this stamp [ns]; None for the first frame."""
+        if self._stamp_ns is None:
+            self._stamp_ns = stamp_ns
+            return None
+        difference = stamp_ns - self._stamp_ns
+        if difference > 0:
+            # d > 1.5 T and |d - d_before| > d / 10, in integers.
+            is_long = self._interval_ns is not None and 2 * difference > 3 * self._interval_ns
+            if not is_long or 10 * abs(difference - self._difference_ns) <= difference:
                 self._interval_ns = difference
             self._difference_ns = difference
-        self._stamp_ns = stamp_ns
+            self._stamp_ns = stamp_ns
         return self._interval_ns

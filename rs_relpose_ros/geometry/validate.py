@@ -1,6 +1,6 @@
 """Checks of arguments: an InputError names the parameter, what is legal and the value given.
 
-A function returns the checked value: numbers as they are, arrays as a contiguous copy.
+Each function returns the checked value: a number as it is, an array as a contiguous copy.
 """
 
 from collections.abc import Collection
@@ -17,17 +17,22 @@ from rs_relpose_ros.geometry import Array
 Number = TypeVar('Number', int, float)
 Data = TypeVar('Data')
 
+# Bound of an array without a bound of its own: every finite number is legal. [derived: IEEE 754]
 _FLOAT_MAX = sys.float_info.max
-# Largest deviation of R^T R from the identity, and of a covariance matrix from its transpose
-# (relative to its largest element), that is rounding.
+# Largest deviation of R^T R from the identity that counts as rounding. Matrices that were written
+# with six digits must pass; beyond it a matrix is no rotation. [chosen: any value in 1e-6..1e-4
+# would do]
 _ROUNDING_ROTATION = 1e-6
+# Largest deviation of a covariance matrix from its transpose, relative to its largest element,
+# that counts as rounding. [chosen: any value in 1e-12..1e-6 would do]
 _ROUNDING_SYMMETRY = 1e-9
 
 
 def unchecked(kind: type[Data], **values: Any) -> Data:
-    """An object of a frozen dataclass from all of its fields, computed from checked values.
+    """Make an object of a frozen dataclass from all of its fields, without its checks.
 
-    A tenth of the time that the checks of small arrays take.
+    This takes a tenth of the time of the checks of small arrays. The values must come from
+    checked values.
     """
     made = object.__new__(kind)
     for name, value in values.items():
@@ -36,17 +41,19 @@ def unchecked(kind: type[Data], **values: Any) -> Data:
 
 
 def replaced(data: Data, **changes: Any) -> Data:
-    """As `dataclasses.replace`, `unchecked`."""
+    """Do what `dataclasses.replace` does, without the checks (`unchecked`)."""
     fields = {name: getattr(data, name) for name in type(data).__slots__}  # type: ignore[attr-defined]
     return unchecked(type(data), **fields | changes)
 
 
 def legal_range(low: float, high: float, unit: str = '') -> str:
-    """The numbers from `low` to `high`, in words."""
+    """Describe the numbers from `low` to `high` in words."""
     unit = f' {unit}'.rstrip()
-    if low == -math.inf:
-        return f'finite{unit}' if high == math.inf else f'<= {high:g}{unit} and finite'
-    return f'>= {low:g}{unit} and finite' if high == math.inf else f'in [{low:g}, {high:g}]{unit}'
+    if -math.inf < low and high < math.inf:
+        return f'in [{low:g}, {high:g}]{unit}'
+    if low > -math.inf:
+        return f'>= {low:g}{unit} and finite'
+    return f'<= {high:g}{unit} and finite' if high < math.inf else f'finite{unit}'
 
 
 def number(
@@ -58,22 +65,19 @@ def number(
     *,
     whole: bool = False,
 ) -> Number:
-    """A finite number in [low, high]; `whole`: without a fraction."""
-    if not _is_within(value, low, high) or (whole and int(value) != value):
+    """Check a finite number in [low, high], which has no fraction if it is `whole`."""
+    try:
+        legal = bool(low <= value <= high and abs(value) < math.inf)
+    except (TypeError, ValueError):  # the value is no number
+        legal = False
+    if not legal or (whole and int(value) != value):
         kind = 'a whole number, ' if whole else ''
         raise InputError(f'{name} must be {kind}{legal_range(low, high, unit)}, got {value!r}')
     return value
 
 
-def _is_within(value: Any, low: float, high: float) -> bool:
-    try:
-        return bool(low <= value <= high and abs(value) < math.inf)
-    except (TypeError, ValueError):  # no number
-        return False
-
-
 def choice(name: str, value: str, choices: Collection[str]) -> str:
-    """One of some names."""
+    """Check that a value is one of some names."""
     if value not in tuple(choices):
         raise InputError(f'{name} must be one of {", ".join(choices)}, got {value!r}')
     return value
@@ -87,26 +91,24 @@ def array(
     largest: float = _FLOAT_MAX,
     unit: str = '',
 ) -> Array:
-    """Finite numbers of a shape, none of a magnitude beyond `largest` [`unit`].
+    """Check an array of finite numbers whose magnitudes do not exceed `largest` [`unit`].
 
-    `shape`: sizes, and names such as 'N' of sizes that may be any, 0 too.
+    `shape` has sizes, and names such as 'N' for sizes that may be any number, 0 too.
     """
     try:
         checked = np.array(value, dtype=np.float64, order='C')
     except (TypeError, ValueError):
         raise InputError(f'{name} must be an array of numbers, got {value!r}') from None
-    if checked.shape != shape and (
-        checked.ndim != len(shape)
-        or any(
-            isinstance(size, int) and size != found
-            for size, found in zip(shape, checked.shape, strict=True)
-        )
-    ):
+    fits = checked.ndim == len(shape) and all(
+        isinstance(size, str) or size == found
+        for size, found in zip(shape, checked.shape, strict=True)
+    )
+    if not fits:
         comma = ',' if len(shape) == 1 else ''
         raise InputError(
             f'{name} must have shape ({", ".join(map(str, shape))}{comma}), got {checked.shape}'
         )
-    legal = np.abs(checked) <= largest  # not NaN
+    legal = np.abs(checked) <= largest  # False for NaN
     if not legal.all():
         place = np.unravel_index(np.argmin(legal), legal.shape)
         text = 'finite' if largest == _FLOAT_MAX else f'finite and within {largest:g} {unit}'
@@ -117,12 +119,12 @@ def array(
 
 
 def unit_vectors(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
-    """Directions of any length but zero, brought to unit length along the last axis."""
+    """Check directions of any length but zero, and scale them to length 1 along the last axis."""
     vectors = array(name, value, shape)
     largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0.0)
     if not (largest > 0.0).all():
         raise InputError(f'{name} must not hold a zero vector, which has no direction')
-    # Divided by the largest element first, lengths neither overflow nor vanish.
+    # After the division by the largest element, lengths neither overflow nor vanish.
     vectors /= largest
     vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors
@@ -136,13 +138,11 @@ def unit_length(name: str, value: ArrayLike, tolerance: float) -> None:
 
 
 def rotations(name: str, value: ArrayLike | None, shape: tuple[int | str, ...] = (3, 3)) -> Array:
-    """A rotation matrix (3, 3), or several of them (K, 3, 3)."""
-    # Bounded first, so that the product cannot overflow.
+    """Check a rotation matrix (3, 3), or several of them (K, 3, 3)."""
+    # The bound keeps the product from overflowing.
     R = array(name, value, shape, largest=2.0)
-    if not (
-        (np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)) < _ROUNDING_ROTATION).all()
-        and (np.linalg.det(R) > 0.0).all()
-    ):
+    deviation = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3))
+    if not ((deviation < _ROUNDING_ROTATION).all() and (np.linalg.det(R) > 0.0).all()):
         raise InputError(
             f'{name} must be a rotation matrix (orthonormal, determinant +1), got {R.tolist()}'
         )
@@ -158,7 +158,7 @@ def covariance(
     unit: str = '',
     rounding: float = 1e-9,
 ) -> Array:
-    """A symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
+    """Check a symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
     matrix = array(name, value, (size, size), largest=largest, unit=unit)
     most = np.abs(matrix).max()
     if most > 0.0 and (
