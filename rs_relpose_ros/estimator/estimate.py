@@ -76,13 +76,25 @@ def evidence_for_inertial(
         return None
     motion = problem.config.motion
     views = problem.without_matches().two_views()
-    expected, _ = velocity.expected_velocities(views, motion, interval, problem.inertial[-1])
-    return velocity.inertial_evidence(views, pose.images, motion, interval, expected)
+    expected, _ = velocity.expected_velocities(
+        views,
+        motion,
+        interval,
+        problem.inertial[-1],
+    )
+    return velocity.inertial_evidence(
+        views,
+        pose.images,
+        motion,
+        interval,
+        expected,
+    )
 
 
 def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> RelativePose:
     """The pose with the global-shutter pixels of its inliers."""
-    camera, matches = problem.camera, problem.matches
+    camera = problem.camera
+    matches = problem.matches
     rays = []
     times = []
     for points, motion in (
@@ -91,7 +103,12 @@ def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> Rela
     ):
         times.append(camera.row_times(points[:, 1]))
         rays.append(motion.derotate(camera.unproject(points), times[-1]))
-    found = landmarks(pose, np.stack(rays), np.stack(times), camera)
+    found = landmarks(
+        pose,
+        np.stack(rays),
+        np.stack(times),
+        camera,
+    )
     return replace(pose, pixels1_gs=found.pixels1, pixels2_gs=found.pixels2)
 
 
@@ -134,7 +151,12 @@ class Estimation:
         self.interval = pair.interval
         self.inertial = pair.inertial[-1]
         self.has_frames_between = len(pair.motions) > 2
-        self.priors = _priors(problem, self.mode, config, self.interval)
+        self.priors = _priors(
+            problem,
+            self.mode,
+            config,
+            self.interval,
+        )
         # Prior of the velocities by the measured acceleration, and the chi-square (6 degrees of
         # freedom) of that acceleration against zero.
         self.measured: VelocityPrior | None = None
@@ -151,7 +173,8 @@ class Estimation:
         With frames between, samples are drawn only if the gyro's rotation fails: all frames will
         refine the pose.
         """
-        usable, least = len(self.order), self.config.min_inliers
+        usable = len(self.order)
+        least = self.config.min_inliers
         if usable < least:
             return self._failure(
                 Status.TOO_FEW_MATCHES,
@@ -209,7 +232,8 @@ class Estimation:
         pose = self._result(refined)
         near = np.abs(sampson.residuals(self.problem.observations, refined.state))
         implausible = (near < self.config.threshold) & ~refined.inliers
-        count, others = np.count_nonzero(refined.inliers), np.count_nonzero(implausible)
+        count = np.count_nonzero(refined.inliers)
+        others = np.count_nonzero(implausible)
         if self.config.refinement == 'map' and (
             count - others < SIGN_SIGMAS * math.sqrt(count + others)
         ):
@@ -250,11 +274,13 @@ class Estimation:
         return priors.signed(state, sign)
 
     def _refined(self, state: TwoViewState) -> Refined:
-        config, matches = self.config, self.matches
+        config = self.config
+        matches = self.matches
         model = self.mode.model
         free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
-            prior, scales = self.priors, velocity.TIMELESS if free else velocity.AT_ZERO
+            prior = self.priors
+            scales = velocity.TIMELESS if free else velocity.AT_ZERO
             if free and self.interval is not None:
                 expected, scales = velocity.expected_velocities(
                     self.problem, config.motion, self.interval, self.inertial
@@ -296,7 +322,8 @@ class Estimation:
         frame 1. Not part of the prior: with the lower weight, the poses of a recording with such
         stamps were not more accurate (docs/estimator.md).
         """
-        problem, sigma = self.problem, self.config.stamp_sigma
+        problem = self.problem
+        sigma = self.config.stamp_sigma
         if problem.rotation is None or sigma == 0.0:
             return np.zeros((3, 3))
         rates = np.column_stack(
@@ -306,9 +333,18 @@ class Estimation:
 
     def _no_consensus(self, inliers: Flags) -> str:
         """Reason why the inliers determine no pose; empty if they may."""
-        config, observations = self.config, self.problem.observations
+        config = self.config
+        observations = self.problem.observations
         cell = config.threshold / self.problem.focal  # [rad]
-        count = min(sampling.distinct_directions(observations, inliers, f, cell) for f in RAYS)
+        count = min(
+            sampling.distinct_directions(
+                observations,
+                inliers,
+                f,
+                cell,
+            )
+            for f in RAYS
+        )
         # Inliers of the best of many fits to random matches (about 5 sigma). Their share, ten
         # thresholds by the focal length, was measured: free velocities bend the epipolar bands, so
         # that the best fit has more than a single one.
@@ -330,7 +366,12 @@ class Estimation:
         """Reason why images and gyro cannot both be right; empty if they may."""
         if self.config.refinement != 'map' or self.problem.rotation is None:
             return ''
-        gain, R = sampling.gain_without_gyro(self.matches, state, self.priors, self.problem.focal)
+        gain, R = sampling.gain_without_gyro(
+            self.matches,
+            state,
+            self.priors,
+            self.problem.focal,
+        )
         if gain < CONTRADICTION:
             return ''
         apart = np.degrees(np.linalg.norm(so3.log_so3(R @ state.R.T)))
@@ -345,8 +386,11 @@ class Estimation:
         In front of a far plane a rotation alone may absorb nearly all of the motion, so it must
         fit the matches to within their noise, not to within some pixels.
         """
-        problem, config = self.problem, self.config
-        state, inliers, sigma = refined.state, refined.inliers, refined.sigma
+        problem = self.problem
+        config = self.config
+        state = refined.state
+        inliers = refined.inliers
+        sigma = refined.sigma
         parallax = so3.median(
             fit.transfer_errors(
                 problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal
@@ -357,7 +401,12 @@ class Estimation:
         R, information = fit.fit_rotation(
             problem.observations, inliers, start, self.priors, problem.focal, sigma
         )
-        left = fit.transfer_errors(problem.observations, inliers, R, problem.focal)
+        left = fit.transfer_errors(
+            problem.observations,
+            inliers,
+            R,
+            problem.focal,
+        )
         median = so3.median(left.copy())
         pure_rotation = median < ROTATION_ONLY_SIGMAS * sigma
         if not pure_rotation and parallax >= config.min_parallax:
@@ -412,7 +461,8 @@ class Estimation:
         """Rotation of each camera from the middle row to the reference row, as corrected."""
         if not self.mode.model.derotated:
             return np.eye(3), np.eye(3)
-        problem, delay = self.problem, self.problem.reference_row_time
+        problem = self.problem
+        delay = self.problem.reference_row_time
         turn1 = problem.motion1.rotations([delay])[0]
         turn2 = problem.motion2.rotations([delay])[0]
         return (
@@ -464,7 +514,8 @@ class Estimation:
         """Information of the images alone; None for models without all unknowns."""
         if not self.mode.model.derotated:
             return None
-        state, observations = refined.state, self.problem.observations
+        state = refined.state
+        observations = self.problem.observations
         weights, sigma = noise_mixture(
             sampson.residuals(observations, state), refined.inliers, self.config.pixel_sigma
         )
@@ -546,11 +597,13 @@ def _priors(
     problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig, interval: float | None
 ) -> Priors:
     """Priors of the IMU; velocities with the wide prior of the comparison of hypotheses."""
-    g1, g2 = problem.motion1.gravity, problem.motion2.gravity
+    g1 = problem.motion1.gravity
+    g2 = problem.motion2.gravity
     known = g1 is not None and g2 is not None
     free = mode.model.velocities or mode.model.derotated
     unit1, unit2 = (np.zeros(3) if g is None else g / np.linalg.norm(g) for g in (g1, g2))
-    rotation, information = problem.rotation, problem.rotation_information
+    rotation = problem.rotation
+    information = problem.rotation_information
     return Priors(
         unit1,
         unit2,

@@ -71,11 +71,22 @@ def refined(pose: RelativePose, problem: PairProblem) -> RelativePose:
         )
     tracks = _track_blocks(path)
     priors = _priors(path)
-    state = _start(pose, path, tracks, priors)
+    state = _start(
+        pose,
+        path,
+        tracks,
+        priors,
+    )
     sigma = config.pixel_sigma
     expected = min(max(pose.diagnostics.residual_rms, _LEAST_NOISE * sigma), sigma)
     for _ in range(2):  # once more without the observations far from the first result
-        adjusted = adjustment.adjust(tracks, priors, state, expected, _SIGMA_FREEDOM)
+        adjusted = adjustment.adjust(
+            tracks,
+            priors,
+            state,
+            expected,
+            _SIGMA_FREEDOM,
+        )
         state = adjusted.state
         tracks.used[adjusted.far] = False
         tracks.observations.swapaxes(2, 3)[
@@ -89,7 +100,13 @@ def refined(pose: RelativePose, problem: PairProblem) -> RelativePose:
             frames_reason='tracks and gyro of the frames between contradict each '
             f'other: {adjusted.sigma:.1f} px',
         )
-    return _result(pose, adjusted, path, tracks, priors)
+    return _result(
+        pose,
+        adjusted,
+        path,
+        tracks,
+        priors,
+    )
 
 
 def _with_inliers(pose: RelativePose, problem: PairProblem) -> PairProblem:
@@ -167,11 +184,17 @@ def _camera_by_imu(path: PairProblem) -> tuple[Array, Array, Array]:
 
 def _track_blocks(path: PairProblem) -> TrackBlocks:
     """Observations of the inliers."""
-    camera, points = path.camera, path.matches.points
+    camera = path.camera
+    points = path.matches.points
     views, count = points.shape[:2]
     rays, jacobian = camera.unproject_with_jacobian(points.reshape(-1, 2))
     rays = rays.reshape(views, count, 3)
-    jacobian = jacobian.reshape(views, count, 3, 2)
+    jacobian = jacobian.reshape(
+        views,
+        count,
+        3,
+        2,
+    )
     used = _usable(rays, points[..., 1], camera.height)
     rows = np.where(used, points[..., 1], camera.reference_row_index)
     blocks = views, -(-count // adjustment.BLOCK)
@@ -216,7 +239,8 @@ def _usable(rays: Array, rows: Array, height: int) -> NDArray[np.bool_]:
 
 def _priors(path: PairProblem) -> PathPriors:
     """Priors of the path, of the gyro's bias and of its rotations."""
-    config, interval = path.config, float(path.seconds[-1])
+    config = path.config
+    interval = float(path.seconds[-1])
     bias_variance, covariance = _gyro_errors(path)
     lowest, highest = span_of_scales(config.motion, interval)
     if _knows_inertial(path):
@@ -305,7 +329,9 @@ def _result(
     priors: PathPriors,
 ) -> RelativePose:
     """The two-view result with the pose, its covariance and the velocities of all frames."""
-    state, C, T = adjusted.state, adjusted.covariance, tracks.duration
+    state = adjusted.state
+    C = adjusted.covariance
+    T = tracks.duration
     off = T * state.bias + state.rotations[-1]  # from the gyro's rotation
     R = exp_so3(off) @ tracks.rotations[-1]
     by_state = np.zeros((6, len(C)))
@@ -320,7 +346,8 @@ def _result(
     velocity_covariance[:3, :3] = by_second @ C @ by_second.T
     of_bias = T * T / priors.bias_weight * np.eye(3)
     of_gyro = of_bias + np.linalg.inv(priors.rotation_information)[-3:, -3:]
-    baseline, log_sigma = pose.baseline, pose.baseline_log_sigma
+    baseline = pose.baseline
+    log_sigma = pose.baseline_log_sigma
     if _knows_inertial(path) and math.isfinite(pose.baseline):
         baseline = 1.0 / math.exp(state.log_scale)
         log_sigma = math.sqrt(C[LOG_SCALE, LOG_SCALE])
@@ -345,7 +372,8 @@ def _result(
 
 def _velocities(state: PathState, path: PairProblem, n: int) -> tuple[Array, Array]:
     """P' at both ends (2, 3), in the axes of camera 1, and its derivatives (2, 3, n)."""
-    T, k = float(path.seconds[-1]), math.exp(state.log_scale)
+    T = float(path.seconds[-1])
+    k = math.exp(state.log_scale)
     _, chord, ends = _camera_by_imu(path)
     bends = T * _BENDS[:, : len(state.accelerations)]
     of_scale = k * (ends - chord / T + bends @ state.accelerations)

@@ -324,7 +324,12 @@ def landmarks(
     moved2 = times2 * pose.linear_velocity2
     in_first = f2 @ pose.R.T
     baselines = pose.t + moved2 @ pose.R.T - moved1
-    l1, l2, near = depths_of_rays(f1, in_first, baselines, _PARALLEL)
+    l1, l2, near = depths_of_rays(
+        f1,
+        in_first,
+        baselines,
+        _PARALLEL,
+    )
     # Inverse distances: 0 at infinity.
     equal1 = f1 + (near / l1)[:, None] * moved1
     equal2 = f2 + (near / l2)[:, None] * moved2

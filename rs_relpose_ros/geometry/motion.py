@@ -68,7 +68,12 @@ class FrameMotion:
             ),
         )
         if self.gravity is not None:
-            gravity = validate.array('gravity', self.gravity, (3,), largest=1e6)
+            gravity = validate.array(
+                'gravity',
+                self.gravity,
+                (3,),
+                largest=1e6,
+            )
             if not np.abs(gravity).max() > 1e-6:
                 raise InputError(
                     'gravity must have a length > 1e-6 (None if it is not known), '
@@ -92,7 +97,13 @@ class FrameMotion:
         gravity : (3,) array_like, optional
             As in the class.
         """
-        times = validate.array('times', times, ('K',), largest=_LONGEST, unit='s')
+        times = validate.array(
+            'times',
+            times,
+            ('K',),
+            largest=_LONGEST,
+            unit='s',
+        )
         rates = validate.array('angular_velocities', angular_velocities, (len(times), 3))
         validate.number('number of times', len(times), 2)
         validate.increasing('times', times)
@@ -232,7 +243,13 @@ class InertialMotion:
     acceleration2: Array | None = None
 
     def __post_init__(self) -> None:
-        validate.number('duration', self.duration, 1e-6, 1e6, 's')
+        validate.number(
+            'duration',
+            self.duration,
+            1e-6,
+            1e6,
+            's',
+        )
         for name, unit, largest in (
             ('alpha', 'm', _LARGEST),
             ('beta', 'm/s', _LARGEST),
@@ -244,12 +261,25 @@ class InertialMotion:
             if value is None:
                 value = self.beta / self.duration
             object.__setattr__(
-                self, name, validate.array(name, value, (3,), largest=largest, unit=unit)
+                self,
+                name,
+                validate.array(
+                    name,
+                    value,
+                    (3,),
+                    largest=largest,
+                    unit=unit,
+                ),
             )
         object.__setattr__(
             self,
             'covariance',
-            validate.covariance('covariance', self.covariance, 6, largest=_LARGEST**2),
+            validate.covariance(
+                'covariance',
+                self.covariance,
+                6,
+                largest=_LARGEST**2,
+            ),
         )
 
     def shifted(self, delay: float, turn: Array) -> InertialMotion:
@@ -258,7 +288,8 @@ class InertialMotion:
         With constant accelerations a_i during the readouts, ``v_i' = v_i + D a_i`` and
         ``p_i' = p_i + D v_i + D^2 a_i / 2``.
         """
-        a1, a2 = np.asarray(self.acceleration1), np.asarray(self.acceleration2)
+        a1 = np.asarray(self.acceleration1)
+        a2 = np.asarray(self.acceleration2)
         change = a2 - a1
         alpha = (
             self.alpha + delay * self.beta + 0.5 * delay**2 * change - delay * self.duration * a1

@@ -39,7 +39,8 @@ class Series:
 
     def __init__(self, gap_ns: int, width: int = 3) -> None:
         self._gap_ns = gap_ns
-        self._stamps, self._values = np.empty(256, dtype=np.int64), np.empty((256, width))
+        self._stamps = np.empty(256, dtype=np.int64)
+        self._values = np.empty((256, width))
         self._start = self._end = 0
 
     @property
@@ -71,11 +72,13 @@ class Series:
             more = max(256, len(stamps))
             self._values = np.concatenate([self.values, np.empty((more, self._values.shape[1]))])
             self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
-            self._start, self._end = 0, len(stamps)
+            self._start = 0
+            self._end = len(stamps)
         at = self._start + position
         self._stamps[at + 1 : self._end + 1] = self._stamps[at : self._end]
         self._values[at + 1 : self._end + 1] = self._values[at : self._end]
-        self._stamps[at], self._values[at] = stamp_ns, value
+        self._stamps[at] = stamp_ns
+        self._values[at] = value
         self._end += 1
         return True
 
@@ -106,7 +109,8 @@ class Series:
         )
 
     def _interpolated(self, at_ns: int) -> Array:
-        stamps, values = self.stamps, self.values
+        stamps = self.stamps
+        values = self.values
         after = int(stamps.searchsorted(at_ns))
         if stamps[after] == at_ns:
             return values[after]
@@ -250,7 +254,8 @@ class ImuSamples:
     @property
     def both_until_ns(self) -> int | None:
         """Time up to which both sensors are known."""
-        gyro, force = self.gyro.newest_ns, self.force.newest_ns
+        gyro = self.gyro.newest_ns
+        force = self.force.newest_ns
         return None if gyro is None or force is None else min(gyro, force)
 
     @property
@@ -409,12 +414,14 @@ class ImuBuffer(ImuSamples):
             estimate = filters.mean_gravity(self.recent_forces(at_ns, filters.MEAN_WINDOW_NS))
         else:
             self._run_filters(at_ns)
-            estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
+            estimate = self._filter.estimate()
+            stamp_ns = self._filter.stamp_ns
             if estimate is not None and stamp_ns is not None:
                 estimate = self._propagated(estimate, stamp_ns, at_ns)
         last = int(np.searchsorted(self._down.stamps, at_ns, side='right')) - 1
         if last >= 0 and self.config.use_imu_orientation:
-            own_ns, (*down, sigma) = int(self._down.stamps[last]), self._down.values[last].tolist()
+            own_ns = int(self._down.stamps[last])
+            (*down, sigma) = self._down.values[last].tolist()
             if (
                 at_ns - own_ns <= self._gap_ns
                 and (
@@ -442,7 +449,8 @@ class ImuBuffer(ImuSamples):
         bounds = np.array([self._filtered_ns, until_ns])
         first, last = np.searchsorted(self.gyro.stamps, bounds, side='right')
         if first < last:
-            stamps, rates = self.gyro.stamps[first:last], self.gyro.values[first:last]
+            stamps = self.gyro.stamps[first:last]
+            rates = self.gyro.values[first:last]
             # The latest specific forces not after these stamps; NaN if older than a gap.
             forces = np.full((len(stamps), 3), np.nan)
             if len(self.force.stamps):
@@ -474,7 +482,13 @@ def frame_imu(
     """
     half = to_nanoseconds(0.5 * exposure)
     span_ns = span_ns[0] + half, span_ns[1] - half  # of the middle of the rows' exposures
-    motion = _rows_motion(buffer, span_ns, reference_ns, R_cam_imu, exposure)
+    motion = _rows_motion(
+        buffer,
+        span_ns,
+        reference_ns,
+        R_cam_imu,
+        exposure,
+    )
     # The filter runs up to the last row; its direction is rotated back to the stamped row.
     gravity = None if gyro_only else buffer.gravity(span_ns[1])
     if gravity is not None:
@@ -488,17 +502,34 @@ def frame_imu(
         no_force = 'the accelerometer has a gap'
     since_previous = None
     if start_ns < reference_ns and buffer.covers(start_ns, reference_ns, exposure):
-        since_previous = _slice(buffer, (start_ns, reference_ns), R_cam_imu, exposure, no_force)
+        since_previous = _slice(
+            buffer,
+            (start_ns, reference_ns),
+            R_cam_imu,
+            exposure,
+            no_force,
+        )
         if not no_force and before is not None:
             since_previous = replace(
                 since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
             )
     sigma = None if gravity is None else gravity.sigma
-    imu = FrameImu(motion, sigma, reference_ns, since_previous, no_force)
+    imu = FrameImu(
+        motion,
+        sigma,
+        reference_ns,
+        since_previous,
+        no_force,
+    )
     if no_force or readout is None or gravity is None:
         return imu
     force = _mean_force(motion, readout[0] - reference_ns, readout[1] @ R_cam_imu.T)
-    return replace(imu, force=force, at_rest=gravity.length, at_rest_sigma=gravity.length_sigma)
+    return replace(
+        imu,
+        force=force,
+        at_rest=gravity.length,
+        at_rest_sigma=gravity.length_sigma,
+    )
 
 
 def _rows_motion(

@@ -104,7 +104,8 @@ class BiasTracker:
             return
         old = self._pending
         stamps_ns = np.concatenate([old[0], stamps_ns])
-        rates, forces = np.concatenate([old[1], rates]), np.concatenate([old[2], forces])
+        rates = np.concatenate([old[1], rates])
+        forces = np.concatenate([old[2], forces])
         start = 0
         # A window is complete with the first sample after its end.
         while start < len(stamps_ns) and stamps_ns[-1] >= stamps_ns[start] + _WINDOW_NS:
@@ -119,11 +120,13 @@ class BiasTracker:
 
     def _evaluate(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
         """Test one window; `stamps_ns` has one more, that of the sample after it."""
-        before, self._rest = self._rest, None
+        before = self._rest
+        self._rest = None
         # Without accelerometer a slow constant rate resembles rest.
         if int(np.diff(stamps_ns).max()) > self._gap_ns or not is_at_rest(rates, forces):
             return
-        spread, seconds = float(rates.std(axis=0).max()), _WINDOW_NS * 1e-9
+        spread = float(rates.std(axis=0).max())
+        seconds = _WINDOW_NS * 1e-9
         rest = _Rest(int(stamps_ns[-1]), rates.mean(axis=0), spread**2 * _SWAY_TIME / seconds)
         variance = self._variance_at(rest.end_ns) + rest.variance
         if float(np.abs(rest.mean - self._bias).max()) > _GATE * math.sqrt(variance):
@@ -133,7 +136,8 @@ class BiasTracker:
             variance = self._variance_at(before.end_ns)
             gain = variance / (variance + before.variance) if variance > 0.0 else 0.0
             self._bias = self._bias + gain * (before.mean - self._bias)
-            self._variance, self._measured_ns = (1.0 - gain) * variance, before.end_ns
+            self._variance = (1.0 - gain) * variance
+            self._measured_ns = before.end_ns
 
     def _variance_at(self, at_ns: int) -> float:
         passed = max(at_ns - self._measured_ns, 0) * 1e-9
@@ -225,7 +229,12 @@ class GravityFilter:
         k = 0
         while k < len(stamps_ns):
             if self.stamp_ns is None:
-                k = self._begin(k, stamps_ns, rates, forces)
+                k = self._begin(
+                    k,
+                    stamps_ns,
+                    rates,
+                    forces,
+                )
                 continue
             done = _advance(
                 self._state,
@@ -239,7 +248,8 @@ class GravityFilter:
             )
             if done:
                 k += done
-                self.stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
+                self.stamp_ns = int(stamps_ns[k - 1])
+                self._rate = rates[k - 1].copy()
             if k < len(stamps_ns):
                 # The rotation during a gap is unknown: the direction is lost.
                 self.stamp_ns = None
@@ -260,9 +270,20 @@ class GravityFilter:
         )
         variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0) ** 2
         length, length_variance = self._state.length
-        return GravityEstimate(-up, math.sqrt(variance), float(length), math.sqrt(length_variance))
+        return GravityEstimate(
+            -up,
+            math.sqrt(variance),
+            float(length),
+            math.sqrt(length_variance),
+        )
 
-    def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
+    def _begin(
+        self,
+        k: int,
+        stamps_ns: NDArray[np.int64],
+        rates: Array,
+        forces: Array,
+    ) -> int:
         """Start from the first specific force at or after sample `k`; the index after it."""
         usable = np.flatnonzero(np.linalg.norm(forces[k:], axis=1) > 0.0)
         if len(usable) == 0:
@@ -270,11 +291,13 @@ class GravityFilter:
         first = k + int(usable[0])
         length = float(np.linalg.norm(forces[first]))
         state = self._state
-        state.up[:], state.residual[:] = forces[first] / length, 0.0
+        state.up[:] = forces[first] / length
+        state.residual[:] = 0.0
         for covariance in (state.covariance, state.errors):
             covariance[:3, 3:] = covariance[3:, :3] = 0.0
             covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
-        self.stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
+        self.stamp_ns = int(stamps_ns[first])
+        self._rate = rates[first].copy()
         return first + 1
 
 
@@ -297,10 +320,21 @@ def _advance(
         dt = (stamps_ns[k] - stamp_ns) * 1e-9
         for i in range(3):
             turn[i] = -(0.5 * (rate[i] + rates[k, i]) - state.bias[i]) * dt
-        _predict(state, noise, turn, dt)
-        stamp_ns, rate = stamps_ns[k], rates[k]
+        _predict(
+            state,
+            noise,
+            turn,
+            dt,
+        )
+        stamp_ns = stamps_ns[k]
+        rate = rates[k]
         if norm(forces[k]) > 0.0:
-            _correct(state, noise, forces[k], dt)
+            _correct(
+                state,
+                noise,
+                forces[k],
+                dt,
+            )
     return len(stamps_ns)
 
 
@@ -312,7 +346,12 @@ def _direction_variance(length: float, acceleration: float) -> float:
 
 
 @small_kernel
-def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
+def _predict(
+    state: _State,
+    noise: _Noise,
+    turn: Array,
+    dt: float,
+) -> None:
     """Rotate by ``E = Exp(turn)`` of ``turn = -(w - b) dt`` (3,).
 
     A direction that is fixed in the world rotates backwards in the IMU frame.
@@ -325,7 +364,8 @@ def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
     _rotate(E, state.residual)
     F = np.zeros((6, 6))
     for i in range(3):
-        F[i, 3 + i], F[3 + i, 3 + i] = dt, 1.0
+        F[i, 3 + i] = dt
+        F[3 + i, 3 + i] = 1.0
         for j in range(3):
             F[i, j] = E[i, j]
     for P, growth in ((state.covariance, noise.turning), (state.errors, noise.gyro)):
@@ -338,7 +378,12 @@ def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
 
 
 @small_kernel
-def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
+def _correct(
+    state: _State,
+    noise: _Noise,
+    force: Array,
+    dt: float,
+) -> None:
     """Kalman update by a specific force (3,), its direction with some variance per axis.
 
     H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
@@ -356,12 +401,17 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     at_rest[1] *= 1.0 - gain
     variance = sharing * _direction_variance(length, noise.acceleration)
     usual = sharing * noise.acceleration / (STANDARD_GRAVITY * STANDARD_GRAVITY)
-    H, PHt = np.zeros((3, 6)), np.empty((6, 3))
-    H[0, 1], H[1, 0] = up[2], -up[2]
-    H[0, 2], H[2, 0] = -up[1], up[1]
-    H[1, 2], H[2, 1] = up[0], -up[0]
+    H = np.zeros((3, 6))
+    PHt = np.empty((6, 3))
+    H[0, 1] = up[2]
+    H[1, 0] = -up[2]
+    H[0, 2] = -up[1]
+    H[2, 0] = up[1]
+    H[1, 2] = up[0]
+    H[2, 1] = -up[0]
     _write_product_transposed(P, H, PHt)
-    S, adjugate = np.zeros((3, 3)), np.empty((3, 3))
+    S = np.zeros((3, 3))
+    adjugate = np.empty((3, 3))
     for i in range(3):
         S[i, i] = variance
     _add_product(H, PHt, S)
@@ -369,7 +419,8 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     for i in range(3):  # S^-1 = adj S / det S
         adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
     determinant = dot(S[0], adjugate[0])
-    K, KHP = np.zeros((6, 3)), np.empty((6, 6))
+    K = np.zeros((6, 3))
+    KHP = np.empty((6, 6))
     _add_product(PHt, adjugate, K)
     turn = np.zeros(3)
     for j in range(3):
@@ -383,7 +434,8 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     _write_product_transposed(K, PHt, KHP)
     P -= KHP
     _mirror(P)
-    rest, half = np.eye(6), np.zeros((6, 6))
+    rest = np.eye(6)
+    half = np.zeros((6, 6))
     _add_product(-K, H, rest)  # I - K H
     _add_product(rest, E, half)
     _write_product_transposed(half, rest, E)

@@ -101,7 +101,12 @@ class FrameImu:
     at_rest_sigma: float = np.nan
 
 
-def mean_rates(stamps_ns: Stamps, rates: Array, at_ns: Stamps, width: float | Array) -> Array:
+def mean_rates(
+    stamps_ns: Stamps,
+    rates: Array,
+    at_ns: Stamps,
+    width: float | Array,
+) -> Array:
     """Exact means (N, 3) of rates (K, 3), linear between samples, over `width` [s] about `at_ns`.
 
     Beyond the samples, the mean is taken over the part of the interval which they cover.
@@ -236,13 +241,24 @@ def preintegrate(
     alpha = twice[-1] + 0.5 * duration**2 * gravity
 
     by_gravity = np.vstack([0.5 * duration**2 * np.eye(3), duration * np.eye(3)])
-    by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
+    by_bias, by_rates = _error_derivatives(
+        seconds,
+        rates,
+        rotations,
+        once,
+        twice,
+    )
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
     crossed = duration**2 / 2.0
     of_noise = so3.by_axes(np.array([[duration**3 / 3.0, crossed], [crossed, duration]]))
     by_arm = _by_lever_arm(duration, rotations[-1], rates)
-    squared_steps = np.einsum('k,kij,klj->il', 1.0 / steps, by_rates, by_rates)
+    squared_steps = np.einsum(
+        'k,kij,klj->il',
+        1.0 / steps,
+        by_rates,
+        by_rates,
+    )
     covariance = (
         config.accel_noise_density**2 * of_noise
         + config.accel_bias_sigma**2 * by_bias @ by_bias.T
@@ -251,7 +267,13 @@ def preintegrate(
         + bias_sigma**2 * by_gyro @ by_gyro.T
         + config.imu_position_sigma**2 * by_arm @ by_arm.T
     )
-    return InertialMotion(alpha, beta, duration, covariance, lever_arm)
+    return InertialMotion(
+        alpha,
+        beta,
+        duration,
+        covariance,
+        lever_arm,
+    )
 
 
 def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
@@ -269,7 +291,8 @@ def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
 
 def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
     """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
-    before, after = forces[:-1], forces[1:]
+    before = forces[:-1]
+    after = forces[1:]
     gained = 0.5 * (after + before) * steps[:, None]
     once = np.vstack([np.zeros(3), np.cumsum(gained, axis=0)])
     curved = (2.0 * before + after) * (steps**2 / 6.0)[:, None]

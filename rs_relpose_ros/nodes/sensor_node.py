@@ -49,7 +49,7 @@ from rs_relpose_ros.nodes.inputs import (
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
-from rs_relpose_ros.pipeline.warm_up import cache_is_filled, release_compiler
+from rs_relpose_ros.pipeline.warm_up import cache_is_filled
 
 if TYPE_CHECKING:
     from rs_relpose_ros.calibrate.live import LiveCalibration
@@ -257,7 +257,6 @@ class Worker(threading.Thread):
         """Work until `stop`."""
         try:
             self._warm_up()
-            release_compiler()
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
             self._consume(FrameFailed(None, error))
             return

@@ -113,9 +113,28 @@ def estimate_wide_pair(
                 history.add(frame.imu, to_frame, tracker.track(frame.image))
     matches = tracker.track(second.image)
     history.add(second.imu, since, matches)
-    pose = estimate(history.problem(second.stamp_ns, matches, sensor, parameters, near=near))
-    rays = pair.derotated(matches, first.imu.motion, second.imu.motion, sensor)
-    return history.result(second, rays, pose, sensor, parameters)
+    pose = estimate(
+        history.problem(
+            second.stamp_ns,
+            matches,
+            sensor,
+            parameters,
+            near=near,
+        )
+    )
+    rays = pair.derotated(
+        matches,
+        first.imu.motion,
+        second.imu.motion,
+        sensor,
+    )
+    return history.result(
+        second,
+        rays,
+        pose,
+        sensor,
+        parameters,
+    )
 
 
 def _since(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:

@@ -72,7 +72,8 @@ class MiddleRow:
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        camera, intrinsics = sensor.camera, sensor.intrinsics
+        camera = sensor.camera
+        intrinsics = sensor.intrinsics
         sizes = intrinsics.image_height, intrinsics.image_width
         # cv2.resize puts node k at pixel (k + 1/2) step - 1/2; one node more on each side, so that
         # all pixels lie between nodes.
@@ -89,7 +90,8 @@ class MiddleRow:
 
     def map(self, motion: FrameMotion) -> RowMap:
         """Where the pixels come from, for a motion relative to the reference row of the camera."""
-        camera, intrinsics = self.sensor.camera, self.sensor.intrinsics
+        camera = self.sensor.camera
+        intrinsics = self.sensor.intrinsics
         # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
         rows = np.linspace(0.0, camera.height - 1.0, _ORIENTATIONS)
         turns = np.einsum(
@@ -133,8 +135,10 @@ class GlobalShutterFrame:
 
     def image(self) -> Pixels:
         """The derotated image, in the encoding of the original."""
-        values, border = self.original.values, _BORDERS[self.border]
-        has_holes, derotated = np.isnan(self.map.nodes).any(), np.empty_like(values)
+        values = self.original.values
+        border = _BORDERS[self.border]
+        has_holes = np.isnan(self.map.nodes).any()
+        derotated = np.empty_like(values)
         for rows, sources in self.map.bands():
             # None, as the types forbid: OpenCV 5 takes an empty second map for one.
             derotated[rows] = cv2.remap(
@@ -150,10 +154,12 @@ class GlobalShutterFrame:
 
     def mask(self) -> Pixels:
         """255 for pixels with a source in the original image, 0 for the border."""
-        width, height = self.map.width, self.map.height
+        width = self.map.width
+        height = self.map.height
         mask = np.empty((height, width), dtype=np.uint8)
         for rows, sources in self.map.bands():
-            u, v = sources[..., 0], sources[..., 1]
+            u = sources[..., 0]
+            v = sources[..., 1]
             mask[rows] = np.where(
                 (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0), 255, 0
             )
@@ -169,7 +175,8 @@ class Unroller(Processor[GlobalShutterFrame]):
 
     def __init__(self, watched: Callable[[], bool] = lambda: False) -> None:
         self._follower: Pipeline | RotationWatch = RotationWatch()
-        self._watched, self._levels = watched, GrayLevels()
+        self._watched = watched
+        self._levels = GrayLevels()
         self._due: tuple[Frame[Any], Parameters] | None = None  # for the follower
         self._middle: MiddleRow | None = None
 
@@ -177,7 +184,8 @@ class Unroller(Processor[GlobalShutterFrame]):
         """Let the pipeline or the watch track the last frame."""
         if self._due is None:
             return
-        (frame, parameters), self._due = self._due, None
+        (frame, parameters) = self._due
+        self._due = None
         follower = self._follower
         if isinstance(follower, RotationWatch) and not self._watched():
             self._follower = RotationWatch()
@@ -210,7 +218,8 @@ class Unroller(Processor[GlobalShutterFrame]):
     def process(self, frame: Frame[Any], parameters: Parameters) -> GlobalShutterFrame:
         """The derotated frame."""
         self.prepare()
-        sensor, imu = parameters.sensor, frame.imu
+        sensor = parameters.sensor
+        imu = frame.imu
         assert frame.encoded is not None
         # Once started it is kept: corrections that are no longer applied are taken back by steps.
         if isinstance(self._follower, RotationWatch) and not self.gyro_only(parameters):
@@ -282,7 +291,8 @@ class RotationWatch(Processor[None]):
             self._tracker = self._tracker or make_tracker(parameters.tracking)
             self._tracker.reset()
             self._tracker.start(frame.image)
-            self._begin, self._last_ns = frame, frame.stamp_ns
+            self._begin = frame
+            self._last_ns = frame.stamp_ns
             return
         # Not predicted by the gyro, which may be wrong.
         matches = self._tracker.track(frame.image)
@@ -320,7 +330,12 @@ def unrolling_loop(
     parameters: Parameters, *, offline: bool = False, watched: Callable[[], bool] = lambda: False
 ) -> FrameLoop[GlobalShutterFrame]:
     """The loop that derotates frames; `watched` is that of `Unroller`."""
-    return FrameLoop(parameters, Unroller(watched), offline=offline, colors=True)
+    return FrameLoop(
+        parameters,
+        Unroller(watched),
+        offline=offline,
+        colors=True,
+    )
 
 
 def warm_up_unroller(parameters: Parameters) -> None:

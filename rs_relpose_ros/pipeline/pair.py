@@ -351,11 +351,21 @@ class TrackHistory:
         unknown: tuple[None, ...] = (None,) * len(imus)
         if not near:
             return 'the frames are further apart than max_keyframe_interval', unknown
-        whole = inertial_of(imus[0], imus[-1], self.since, parameters)
+        whole = inertial_of(
+            imus[0],
+            imus[-1],
+            self.since,
+            parameters,
+        )
         if isinstance(whole, str):
             return whole, unknown
         assert self.since is not None
-        on_the_way = motions_on_the_way(whole, imus[0], self.since, imus[1:-1])
+        on_the_way = motions_on_the_way(
+            whole,
+            imus[0],
+            self.since,
+            imus[1:-1],
+        )
         return '', (None, *on_the_way, whole)
 
     # Each step of a tracker adds its error, and the windows of a pair's last frame are aligned
@@ -394,7 +404,12 @@ class TrackHistory:
 
         @cache
         def points() -> Landmarks:
-            found = landmarks(pose, matches.rays, matches.row_times, sensor.camera)
+            found = landmarks(
+                pose,
+                matches.rays,
+                matches.row_times,
+                sensor.camera,
+            )
             to_image = sensor.intrinsics.to_image  # pixels of the published images
             return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
 
@@ -432,14 +447,20 @@ def inertial_of(
         return 'use_gyro_rotation is false'
     if since is None:
         return 'the gyro has a gap'
-    return inertial_motion(since, first, second, parameters.imu)
+    return inertial_motion(
+        since,
+        first,
+        second,
+        parameters.imu,
+    )
 
 
 def _with_gravity(
     imu1: FrameImu, imu2: FrameImu, parameters: Parameters
 ) -> tuple[FrameMotion, FrameMotion, float]:
     """Motions with gravity, both or none, and the sigma of gravity for the estimator."""
-    sigma1, sigma2 = imu1.gravity_sigma, imu2.gravity_sigma
+    sigma1 = imu1.gravity_sigma
+    sigma2 = imu2.gravity_sigma
     configured = parameters.estimator.gravity_sigma
     if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
         return (

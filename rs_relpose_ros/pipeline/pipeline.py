@@ -33,7 +33,8 @@ from rs_relpose_ros.tracking.features import make_tracker, Tracker
 
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
 # compared with the gyro.
-_ROTATION_POINTS, _ROTATION_FRAMES = 120, 3
+_ROTATION_POINTS = 120
+_ROTATION_FRAMES = 3
 # Least time between two pairs with too few matches [s].
 _UNMATCHED_PERIOD = 0.5
 # Reason for a pair without the accelerometer.
@@ -118,20 +119,31 @@ class Pipeline(Processor[PairResult]):
         sensor = self._sensor_of(frame.intrinsics, parameters)
         self._stamps_ns.append(frame.stamp_ns)
         self._monitor.ahead.append(frame.ahead)
-        history, previous = self._history, self._previous
+        history = self._history
+        previous = self._previous
         step = frame.imu.since_previous
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if history is None or previous is None or step is None:
             self._tracker.start(frame.image)
             self._restart_from(frame)
             return None
-        predicted = self._predicted(previous.imu.motion, frame.imu.motion, step.rotation, sensor)
+        predicted = self._predicted(
+            previous.imu.motion,
+            frame.imu.motion,
+            step.rotation,
+            sensor,
+        )
         passed = seconds_between(previous.stamp_ns, frame.stamp_ns)
         matches = self._tracker.track(frame.image, predicted, passed)
         self._previous = frame
         since = step if history.since is None else history.since.joined(step)
         history.add(frame.imu, since, matches)
-        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
+        rays = self._derotate(
+            matches,
+            history.imu.motion,
+            frame.imu.motion,
+            sensor,
+        )
         keyframe = pair.is_keyframe(
             parameters.keyframes,
             parallax=pair.parallax_of(rays, since, sensor),
@@ -146,7 +158,12 @@ class Pipeline(Processor[PairResult]):
             compare()
             return None
         self._compare = compare
-        result = self._pair(history, frame, sensor, parameters)
+        result = self._pair(
+            history,
+            frame,
+            sensor,
+            parameters,
+        )
         self._restart_from(frame)
         unmatched = result.pose.status is Status.TOO_FEW_MATCHES
         return None if unmatched and self._is_repeated(frame.stamp_ns) else result
@@ -174,7 +191,8 @@ class Pipeline(Processor[PairResult]):
     def prepare(self) -> None:
         """Assess the configuration and search new corners, after a pair is published."""
         if self._compare is not None:
-            compare, self._compare = self._compare, None
+            compare = self._compare
+            self._compare = None
             compare()
             self._monitor.assess()
             self._tracker.promote()
@@ -205,7 +223,8 @@ class Pipeline(Processor[PairResult]):
             return None
         known = self._of_previous
         if known is not None and np.array_equal(known.points2, points):
-            rays, row_times = known.rays[-1], known.row_times[-1]
+            rays = known.rays[-1]
+            row_times = known.row_times[-1]
         else:
             rays, row_times = sensor.derotated(points, previous)
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
@@ -215,7 +234,13 @@ class Pipeline(Processor[PairResult]):
         self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion, sensor: Sensor
     ) -> Matches:
         """The matches of reference and current image with their rays, which are kept."""
-        rays = pair.derotated(matches, motion1, motion2, sensor, self._of_reference)
+        rays = pair.derotated(
+            matches,
+            motion1,
+            motion2,
+            sensor,
+            self._of_reference,
+        )
         self._of_reference = self._of_previous = rays
         return rays
 
@@ -228,7 +253,8 @@ class Pipeline(Processor[PairResult]):
         """
         before = self._rotation
         if before is not None:
-            before.by_gyro, before.frames = before.by_gyro @ by_gyro, before.frames + 1
+            before.by_gyro = before.by_gyro @ by_gyro
+            before.frames = before.frames + 1
             # If tracks are lost, pairs are created early, and few tracks live longer.
             if not keyframe and before.frames < _ROTATION_FRAMES:
                 return
@@ -237,7 +263,12 @@ class Pipeline(Processor[PairResult]):
             sensor.intrinsics.to_sensor(matches.points2[:_ROTATION_POINTS])
         )
         if before is not None:
-            _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
+            _, old, new = np.intersect1d(
+                before.ids,
+                ids,
+                assume_unique=True,
+                return_indices=True,
+            )
             by_images = rotation_of_rays(before.rays[old], rays[new])
             if by_images is not None:
                 self._monitor.rotations.add(
@@ -254,7 +285,8 @@ class Pipeline(Processor[PairResult]):
         self, history: TrackHistory, frame: Frame[Any], sensor: Sensor, parameters: Parameters
     ) -> PairResult:
         """The pair, suppressed by the state before it; updates the tracked corrections."""
-        monitor, since = self._monitor, history.since
+        monitor = self._monitor
+        since = history.since
         assert since is not None
         matches = self._tracker.refined_matches()
         problem = history.problem(
@@ -269,19 +301,50 @@ class Pipeline(Processor[PairResult]):
         fitted = pose.diagnostics.rejected or pose
         measurement = None
         if fitted.rotation_known:
-            measurement = _measurement(problem, fitted, since, parameters)
-        configured = self._configured(frame.applied_offset_ns, since, sensor, parameters)
-        assessed = monitor.add_pair(frame.stamp_ns, measurement, fitted, configured)
+            measurement = _measurement(
+                problem,
+                fitted,
+                since,
+                parameters,
+            )
+        configured = self._configured(
+            frame.applied_offset_ns,
+            since,
+            sensor,
+            parameters,
+        )
+        assessed = monitor.add_pair(
+            frame.stamp_ns,
+            measurement,
+            fitted,
+            configured,
+        )
         if fitted is pose:
-            pose = monitor.agreement.enlarged(history.stamp_ns, frame.stamp_ns, pose, assessed)
+            pose = monitor.agreement.enlarged(
+                history.stamp_ns,
+                frame.stamp_ns,
+                pose,
+                assessed,
+            )
         tracked = Tracked.of(monitor.calibration, configured)
         self.applied = self.applied.moved(tracked, parameters.sensor)
         if parameters.pair.withhold_when_wrong:
             pose = suppressed(pose, monitor.health)
-        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
+        rays = self._derotate(
+            matches,
+            history.imu.motion,
+            frame.imu.motion,
+            sensor,
+        )
         latest = monitor.latest
         return replace(
-            history.result(frame, rays, pose, sensor, parameters),
+            history.result(
+                frame,
+                rays,
+                pose,
+                sensor,
+                parameters,
+            ),
             images_against_gyro=None if latest is None else latest.images_against_gyro,
             health=monitor.health,
             tracked=tracked,
@@ -313,7 +376,8 @@ class Pipeline(Processor[PairResult]):
 
     def _estimated(self, problem: PairProblem, stamp_ns: int) -> RelativePose:
         """The pose, without the accelerometer if the images contradict it."""
-        inertial, acceleration = problem.inertial[-1], self._monitor.acceleration
+        inertial = problem.inertial[-1]
+        acceleration = self._monitor.acceleration
         acceleration.report(stamp_ns, inertial or problem.no_inertial)
         if inertial is None:
             return estimate(problem)
@@ -394,7 +458,12 @@ class FrameLoop(Generic[Result]):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.parameters = parameters
-        self.sequencer = Sequencer(parameters, offline=offline, colors=colors, clock=clock)
+        self.sequencer = Sequencer(
+            parameters,
+            offline=offline,
+            colors=colors,
+            clock=clock,
+        )
         self._processor = processor
         self._offline = offline
 
@@ -443,7 +512,12 @@ class FrontEnd(FrameLoop[PairResult]):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._pipeline = Pipeline(parameters, keep_images, tracker)
-        super().__init__(parameters, self._pipeline, offline=offline, clock=clock)
+        super().__init__(
+            parameters,
+            self._pipeline,
+            offline=offline,
+            clock=clock,
+        )
 
     @property
     def health(self) -> findings.Assessment:

@@ -32,9 +32,11 @@ CLOCK_JUMP_NS = NANOSECONDS
 _FAR_NS = 10 * NANOSECONDS
 # Number of consecutive stamps behind the newest, each newer than the one before, that indicate a
 # clock that was set back by less than that: messages out of order come alone.
-_BACK_FRAMES, _BACK_SAMPLES = 3, 20
+_BACK_FRAMES = 3
+_BACK_SAMPLES = 20
 # Most frames that wait for the worker (bounds the latency), and for the IMU (the memory).
-MAILBOX_FRAMES, WAITING_FRAMES = 5, 16
+MAILBOX_FRAMES = 5
+WAITING_FRAMES = 16
 # Longest time [ns] that a frame waits for the IMU.
 MAX_IMU_WAIT_NS = NANOSECONDS
 # Delay [ns] behind the gyro above which frames do not wait for an accelerometer of its own topic.
@@ -102,7 +104,8 @@ class _StampOrder:
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
-        self._back_ns, self._count = 0, 0
+        self._back_ns = 0
+        self._count = 0
         self._wild_ns: int | None = None  # the last one, unless the clock jumped to it
 
     def is_wild(self, stamp_ns: int, last_ns: int | None) -> bool:
@@ -120,7 +123,8 @@ class _StampOrder:
             self._count = 0
             return False
         continued = 0 < self._count < self._patience and stamp_ns > self._back_ns
-        self._back_ns, self._count = stamp_ns, self._count + 1 if continued else 1
+        self._back_ns = stamp_ns
+        self._count = self._count + 1 if continued else 1
         return self._count >= self._patience
 
 
@@ -140,9 +144,11 @@ class Sequencer:
         colors: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._parameters, self._offline = parameters, offline
+        self._parameters = parameters
+        self._offline = offline
         self._R_cam_imu = parameters.sensor.R_cam_imu
-        self._colors, self._levels = colors, GrayLevels()
+        self._colors = colors
+        self._levels = GrayLevels()
         self.gyro_only = False  # whether frames are without gravity and specific force
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
         self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
@@ -171,14 +177,18 @@ class Sequencer:
 
     def add_imu(self, sample: ImuSample) -> None:
         """Store an IMU sample; InputError if it is unusable, and nothing is stored."""
-        has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
+        has_gyro = sample.angular_velocity is not None
+        stamp_ns = sample.stamp_ns
         with self._changed:
-            buffer, counts, order = self._buffer, self._counts, self._sample_orders[has_gyro]
+            buffer = self._buffer
+            counts = self._counts
+            order = self._sample_orders[has_gyro]
             last_ns = (buffer.gyro if has_gyro else buffer.force).newest_ns
             if order.is_wild(stamp_ns, last_ns):
                 counts.imu_wild += 1
                 return
-            newest_ns, set_back = buffer.newest_ns, order.is_set_back(stamp_ns, last_ns)
+            newest_ns = buffer.newest_ns
+            set_back = order.is_set_back(stamp_ns, last_ns)
             if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
                 self._restart(
                     Refusal.CLOCK_JUMP,
@@ -277,7 +287,8 @@ class Sequencer:
             # Offline nothing comes while one waits.
             deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
             while (head := self._decided_head()) is None:
-                now_ns, until_ns = self._now(), deadline_ns
+                now_ns = self._now()
+                until_ns = deadline_ns
                 if self._closed or now_ns >= deadline_ns:
                     return None
                 if self._queue:
@@ -285,7 +296,8 @@ class Sequencer:
                 self._changed.wait(max(until_ns - now_ns, 0) / NANOSECONDS)
         if isinstance(head, FrameRefused):
             return head
-        image, taken_ns = head.image, self._now()
+        image = head.image
+        taken_ns = self._now()
         try:
             values, encoding = (
                 image.pixels(self._levels)
@@ -321,7 +333,8 @@ class Sequencer:
                     'stamps jumped while the frame was decoded: its gyro samples are lost',
                 )
                 return self._refusals.popleft()
-            reference_ns, previous_ns = head.reference_ns + self._offset_ns, self._previous_ns
+            reference_ns = head.reference_ns + self._offset_ns
+            previous_ns = self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
             frame.applied_offset_ns = self._offset_ns
@@ -335,7 +348,8 @@ class Sequencer:
                 gyro_only=self.gyro_only,
             )
             frame.restart = self._taken_generation != self._generation
-            self._previous_ns, self._taken_generation = reference_ns, self._generation
+            self._previous_ns = reference_ns
+            self._taken_generation = self._generation
             self._counts.frames_taken += 1
             return frame
 
@@ -374,7 +388,8 @@ class Sequencer:
 
     def _update_queue(self) -> None:
         """Mark the frames that the IMU covers by now, and keep the queue within its bounds."""
-        now_ns, ready = self._now(), 0
+        now_ns = self._now()
+        ready = 0
         for queued in tuple(self._queue):
             if queued.ready_ns is None:
                 if not self._imu_reaches(self._corrected(queued.span_ns)[1]):
@@ -408,7 +423,8 @@ class Sequencer:
 
     def _imu_reaches(self, end_ns: int) -> bool:
         """Whether gyro and accelerometer, which may have a topic each, have come to a time."""
-        gyro_ns, force_ns = self._buffer.gyro.newest_ns, self._buffer.force.newest_ns
+        gyro_ns = self._buffer.gyro.newest_ns
+        force_ns = self._buffer.force.newest_ns
         if gyro_ns is None or gyro_ns < end_ns:
             return False
         # Gravity must not depend on which of two topics came first.

@@ -6,15 +6,14 @@ fills the cache on two cores in a minute: the first run then starts at once.
 """
 
 from collections.abc import Iterator
-import ctypes
+from dataclasses import replace
 import gc
-import mmap
-import multiprocessing
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
 
 import cv2
 from llvmlite.binding import get_host_cpu_name
@@ -24,8 +23,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
 from rs_relpose_ros.estimator import frames_between
-from rs_relpose_ros.estimator.arguments import estimate_relative_pose, IntermediateFrame
-from rs_relpose_ros.estimator.estimate import Estimation
+from rs_relpose_ros.estimator.estimate import estimate, Estimation
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import MODES
@@ -42,8 +40,10 @@ from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.solvers.common import Solutions
 from rs_relpose_ros.tracking.images import RawImage
 
-_WIDTH, _HEIGHT = 320, 240
-_PR_SET_PDEATHSIG = 1
+# Size of the made-up images [px]: small, as their content does not matter, but large enough to be
+# searched at half size, as most images are. [chosen: any size above 240 would do]
+_WIDTH = 320
+_HEIGHT = 240
 # With distortion, so that its kernels are compiled, too.
 _INTRINSICS = Intrinsics(
     width=_WIDTH,
@@ -64,23 +64,13 @@ MADE_UP_SENSOR = {
     'time_offset': 0.0,
     'stamp_exposure': 'middle',
 }
-_ROTATION = np.eye(3), 1e-4 * np.eye(3)  # by the gyro, with its covariance
+# Rotation of a made-up pair by the gyro, with its covariance.
+_ROTATION = np.eye(3), 1e-4 * np.eye(3)
 
 
 def warm_up(config: EstimatorConfig | None = None) -> None:
     """Compile (or load from the cache) every kernel of an estimate with `config`."""
-    points1, points2, camera, motion = _sideways()
-    estimate_relative_pose(
-        points1,
-        points2,
-        camera,
-        motion,
-        motion,
-        *_ROTATION,
-        0.2,
-        config=config,
-        between=[_halfway()],
-    )
+    estimate(replace(_problem(), config=config or EstimatorConfig()))
 
 
 def warm_up_pipeline(parameters: Parameters) -> None:
@@ -100,7 +90,8 @@ def warm_up_pipeline(parameters: Parameters) -> None:
 
 def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator[Frame[Result]]:
     """A few made-up frames, as processed by an offline loop."""
-    images, frame_ns = list(_images()), NANOSECONDS // 30
+    images = list(_images())
+    frame_ns = NANOSECONDS // 30
     force = (0.0, -9.81, 0.0) if with_force else None
     for stamp_ns in range(0, (len(images) + 3) * frame_ns, NANOSECONDS // 200):
         loop.sequencer.add_imu(ImuSample(NANOSECONDS + stamp_ns, (0.01, 0.02, 0.03), force))
@@ -124,11 +115,6 @@ def _images() -> Iterator[NDArray[np.uint8]]:
         image = np.roll(far, -shift, axis=1)
         image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
         yield image
-
-
-def _halfway() -> IntermediateFrame:
-    points1, points2, _, motion = _sideways()
-    return IntermediateFrame(0.5 * (points1 + points2), motion, 0.1, *_ROTATION)
 
 
 def _problem() -> PairProblem:
@@ -160,17 +146,26 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
 
 
+# -- The cache of the kernels: other processes fill it, so that their memory is freed -------------
+
+# Garbage collections of Python while kernels compile: their syntax trees are no garbage, so that
+# looking for some costs a tenth of the time. [measured: compilation of all kernels]
+_GC_THRESHOLD = 100_000
+# More inliers than any pair has matches: a pipeline with it does everything but the estimate.
+_UNREACHABLE = 10_000
+# Arguments of this module for processes that another one has started: they compile all kernels,
+# or those of the two-view estimate alone.
+_WHOLE = 'whole'
+_HALF = 'half'
+
+
 def fill_cache() -> None:
     """Compile the kernels of the default parameters, on two cores, one process each."""
-    gc.set_threshold(100_000)  # syntax trees do not become garbage: a tenth faster
-    other_half = multiprocessing.get_context('fork').Process(
-        target=_fill_half, args=(os.getpid(),)
-    )
-    other_half.start()
+    gc.set_threshold(_GC_THRESHOLD)
+    other_half = _started(_HALF)
     for solver in MODES[EstimatorConfig().solver].solvers:
         assert solver.address
-    # No pair has that many matches: everything but the estimate.
-    warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+    warm_up_pipeline(Parameters.from_mapping({'min_inliers': _UNREACHABLE}))
     problem = _problem()
     pose = RelativePose(
         status=Status.OK,
@@ -181,30 +176,40 @@ def fill_cache() -> None:
     )
     frames_between.refined(pose, problem)
     Estimation(problem).sample()  # with what the other process has compiled by then
-    other_half.join()
+    other_half.wait()
     warm_up_pipeline(Parameters())
     _mark().touch()
 
 
-def _fill_half(parent: int) -> None:
+def _fill_half() -> None:
     """Compile a two-view estimate without sampling."""
-    _end_with(parent)
-    Estimation(_problem()).refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
+    gc.set_threshold(_GC_THRESHOLD)
+    hypothesis = Solutions(np.eye(3)[None], np.eye(1, 9))
+    Estimation(_problem()).refine(hypothesis)
 
 
-def _end_with(parent: int) -> None:
-    """Let the kernel of Linux end this process with its parent, or with the thread of it."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it has ended already
-        signal.raise_signal(signal.SIGKILL)
+def _started(*arguments: str) -> subprocess.Popen[bytes]:
+    """A process of this module that ends soon after this one: its stdin is a pipe from here."""
+    return subprocess.Popen(
+        [sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up', *arguments],
+        stdin=subprocess.PIPE,
+    )
+
+
+def _end_with_stdin() -> None:
+    """End this process when the other end of its stdin is closed."""
+
+    def wait() -> None:
+        os.read(0, 1)
+        signal.raise_signal(signal.SIGKILL)  # whatever the compiler does
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _mark() -> Path:
     """File of a filled cache: by sources, version and machine."""
-    return Path(
-        exp_so3.stats.cache_path,
-        f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}',
-    )
+    sources = source_digest(__name__)[:16]
+    return Path(exp_so3.stats.cache_path, f'{sources}-{get_host_cpu_name()}-{numba.__version__}')
 
 
 def cache_is_filled() -> bool:
@@ -213,25 +218,15 @@ def cache_is_filled() -> bool:
 
 
 def fill_cache_if_empty() -> None:
-    """Compile in processes of their own: their memory, some 700 MB, is freed."""
+    """Compile in other processes: their memory, some 700 MB, is freed."""
     if not cache_is_filled():
-        subprocess.run(
-            [sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up', str(os.getpid())],
-            check=False,
-        )
-
-
-def release_compiler() -> None:
-    """Free the 60 MB of LLVM's code (Linux), which a kernel that is compiled later loads again."""
-    advise = ctypes.CDLL(None).madvise
-    for line in Path('/proc/self/maps').read_text().splitlines():
-        addresses, access, *_, path = line.split(maxsplit=5)
-        if access == 'r-xp' and 'llvmlite' in path:  # unchanged pages of the file
-            start, end = (int(address, 16) for address in addresses.split('-'))
-            advise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), mmap.MADV_DONTNEED)
+        _started(_WHOLE).wait()
 
 
 if __name__ == '__main__':
     if len(sys.argv) > 1:
-        _end_with(int(sys.argv[1]))
-    fill_cache()
+        _end_with_stdin()
+    if sys.argv[1:] == [_HALF]:
+        _fill_half()
+    else:
+        fill_cache()

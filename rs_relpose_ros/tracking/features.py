@@ -27,7 +27,12 @@ _SHORTEST_HALVED = 240
 _ALL = 1e-9
 
 
-def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig) -> Array:
+def find_corners(
+    image: Image,
+    taken: Array,
+    count: int,
+    config: TrackingConfig,
+) -> Array:
     """At most `count` new corners (K, 2) [px], at a distance from existing ones `taken` (M, 2).
 
     The best of each cell of a grid first, then the second best, and so on. Whole pixels: the
@@ -49,12 +54,22 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     )
     free[-margin:] = 0
     _occupy(free, taken / scale, math.ceil(distance))
-    points = scale * _strong_corners(image, free, distance, config.feature_quality)
+    points = scale * _strong_corners(
+        image,
+        free,
+        distance,
+        config.feature_quality,
+    )
     cell = math.sqrt(height * width / config.max_features)
     return points[_spread(points, taken, cell)[:count]]
 
 
-def _strong_corners(image: Image, free: Image, distance: float, least: float) -> Array:
+def _strong_corners(
+    image: Image,
+    free: Image,
+    distance: float,
+    least: float,
+) -> Array:
     """Corners (N, 2) at nonzero pixels of `free` (H, W), best first, at a mutual distance.
 
     `least`: smallest eigenvalue of the structure tensor [gray^2/px^2].
@@ -74,7 +89,8 @@ def _occupy(free: Image, points: Array, radius: int) -> None:
     """Clear the discs around `points` (M, 2)."""
     height, width = free.shape
     for k in range(points.shape[0]):
-        x, y = round(points[k, 0]), round(points[k, 1])
+        x = round(points[k, 0])
+        y = round(points[k, 1])
         for row in range(max(y - radius, 0), min(y + radius + 1, height)):
             for column in range(max(x - radius, 0), min(x + radius + 1, width)):
                 if (column - x) ** 2 + (row - y) ** 2 <= radius * radius:
@@ -150,10 +166,12 @@ class DescriptorTracker:
         self._config = config
         if config.detector == 'sift':
             self._detector: cv2.Feature2D = cv2.SIFT.create(nfeatures=config.max_descriptors)
-            self._norm, self._depth = cv2.NORM_L2, cv2.CV_32F
+            self._norm = cv2.NORM_L2
+            self._depth = cv2.CV_32F
         else:
             self._detector = cv2.ORB.create(nfeatures=config.max_descriptors)
-            self._norm, self._depth = cv2.NORM_HAMMING, cv2.CV_32S
+            self._norm = cv2.NORM_HAMMING
+            self._depth = cv2.CV_32S
         self._ids = TrackIds()
         self.reset()
 
@@ -243,15 +261,22 @@ class DescriptorTracker:
         if len(first.ids) < 2 or len(second.ids) < 2:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
         distances, nearest = self._nearest(first.descriptors, second.descriptors, 2)
-        best, other = distances[:, 0], distances[:, 1]
+        best = distances[:, 0]
+        other = distances[:, 1]
         # Two equally good neighbours, even perfect ones, are no match.
-        ratio = np.divide(best, other, out=np.ones_like(best), where=other > 0.0)
+        ratio = np.divide(
+            best,
+            other,
+            out=np.ones_like(best),
+            where=other > 0.0,
+        )
         matched = np.flatnonzero(ratio < self._config.match_ratio)
         partners = nearest[matched, 0]
         if len(matched):
             _, back = self._nearest(second.descriptors[partners], first.descriptors, 1)
             mutual = back[:, 0] == matched
-            matched, partners = matched[mutual], partners[mutual]
+            matched = matched[mutual]
+            partners = partners[mutual]
         return matched, partners, 1.0 - ratio[matched]
 
     def _nearest(

@@ -28,7 +28,8 @@ _LEAST_FILLED = 0.3
 _LEAST_RANGE = 255.0
 
 # An image is dark if this percentage of its pixels is below this gray level.
-_DARK_SHARE, _DARK_GRAY = 99.0, 32
+_DARK_SHARE = 99.0
+_DARK_GRAY = 32
 
 
 class GrayLevels:
@@ -78,7 +79,8 @@ _PADDING = 4096
 
 def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
     """Width and height [px] in the header of a JPEG or PNG."""
-    start, end = data[:24].tobytes(), data[-_PADDING:].tobytes()
+    start = data[:24].tobytes()
+    end = data[-_PADDING:].tobytes()
     if start.startswith(_PNG_SIGNATURE):
         if len(start) < 24 or start[12:16] != b'IHDR' or b'IEND' not in end:
             raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')
@@ -216,7 +218,8 @@ class RawImage:
 
         `levels`: of the camera's images so far, for pixels of 16 bits; None: of this one.
         """
-        levels, encoding = levels or GrayLevels(), self.encoding
+        levels = levels or GrayLevels()
+        encoding = self.encoding
         if encoding in _GRAY:
             return self._rows(1)
         if encoding in _GRAY_16:
@@ -258,7 +261,9 @@ class RawImage:
     def _rows(self, bytes_per_pixel: int) -> Bytes:
         """Array (height, bytes of a row) of the data without padding; a view if there is none."""
         check_image_size(self.width, self.height)
-        height, step, row_bytes = self.height, self.step, bytes_per_pixel * self.width
+        height = self.height
+        step = self.step
+        row_bytes = bytes_per_pixel * self.width
         if step < row_bytes:
             raise InputError(
                 f'image step is {step} bytes, but a row of {self.width} px in '

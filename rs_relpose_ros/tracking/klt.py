@@ -33,7 +33,9 @@ _ALIGNMENT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.00
 _NEAR = 2.0
 # Levels of the pyramid for a predicted motion, and if the guesses of the last frame were off by at
 # most half of _NEAR, except for a share.
-_EXPECTED_LEVELS, _NEAR_LEVELS, _MOST_FAR = 2, 1, 0.05
+_EXPECTED_LEVELS = 2
+_NEAR_LEVELS = 1
+_MOST_FAR = 0.05
 # Share of lost tracks above which the search is repeated with all levels.
 _MOST_LOST = 0.15
 # Share of lost tracks above which the prediction is not used: a gyro in a wrong unit or axes.
@@ -83,9 +85,25 @@ def follow(
                 criteria,
             )
             guess = np.where(coarse.found[:, None], 2.0 * coarse.points, guess)
-        flow = _near(image1, image2, points1, guess, side, radius, criteria)
+        flow = _near(
+            image1,
+            image2,
+            points1,
+            guess,
+            side,
+            radius,
+            criteria,
+        )
     else:
-        flow = whole_images(image1, image2, points1, guess, side, levels, criteria)
+        flow = whole_images(
+            image1,
+            image2,
+            points1,
+            guess,
+            side,
+            levels,
+            criteria,
+        )
     return Flow(flow.points, flow.found & inside(image2, flow.points), flow.strength)
 
 
@@ -138,7 +156,8 @@ def _near(
     criteria: Criteria,
 ) -> Flow:
     """`follow` on patches, which end `_REACH` pixels from the guess."""
-    first, second = windows.cut(image1, points1, radius), windows.cut(image2, guess, radius)
+    first = windows.cut(image1, points1, radius)
+    second = windows.cut(image2, guess, radius)
     flow = whole_images(
         first.image, second.image, points1 + first.shifts, guess + second.shifts, side, 1, criteria
     )
@@ -155,20 +174,49 @@ def aligned(
     matches: Matches, reference: Image, current: Image, config: TrackingConfig
 ) -> tuple[Matches, NDArray[np.bool_]]:
     """`matches` (N) with their second points aligned, and a mask (N,) of those that correlate."""
-    points1, points2, side = matches.points1, matches.points2, config.klt_window
+    points1 = matches.points1
+    points2 = matches.points2
+    side = config.klt_window
     radius = patch_radius(side, math.ceil(_LARGEST_CORRECTION))
     jacobians = window_jacobians(points1, points2)
-    there = windows.cut_warped(current, points2, jacobians, radius, points1)
+    there = windows.cut_warped(
+        current,
+        points2,
+        jacobians,
+        radius,
+        points1,
+    )
     here = windows.cut(reference, points1, radius)
     image = windows.with_brightness(
-        there.image, windows.brightness_table(reference, current, points1, points2, side)
+        there.image,
+        windows.brightness_table(
+            reference,
+            current,
+            points1,
+            points2,
+            side,
+        ),
     )
     start = points1 + here.shifts
-    flow = whole_images(here.image, image, start, start, side, 1, _ALIGNMENT_CRITERIA)
+    flow = whole_images(
+        here.image,
+        image,
+        start,
+        start,
+        side,
+        1,
+        _ALIGNMENT_CRITERIA,
+    )
     # From the pixels of the reference to those of the current image: p2 + J (x - p1).
     correction = np.einsum('nij,nj->ni', jacobians, flow.points - start)
     found = points2 + correction
-    correlation = windows.correlations(here.image, image, start, flow.points, side)
+    correlation = windows.correlations(
+        here.image,
+        image,
+        start,
+        flow.points,
+        side,
+    )
     # Patches repeat the border of the image: a match there is not in the image.
     good = (
         flow.found
@@ -260,19 +308,32 @@ class KltTracker:
         """Follow the corners into `image`, the new current one; see `Tracker.track`."""
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
-        previous, points = self._current, self.points
+        previous = self._current
+        points = self.points
         current = checked(image, previous.shape)
         expected = predicted is not None or bool(self._unexplained.any())
         predicted = points if predicted is None else _usable(predicted, points, image.shape)
         guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
         observed = windows.with_brightness(
             current,
-            windows.brightness_table(previous, current, points, guess, self._config.klt_window),
+            windows.brightness_table(
+                previous,
+                current,
+                points,
+                guess,
+                self._config.klt_window,
+            ),
         )
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
-        found, good = self._follow_and_return(previous, observed, points, guess, levels)
+        found, good = self._follow_and_return(
+            previous,
+            observed,
+            points,
+            guess,
+            levels,
+        )
         # Many losses: the motion was not the expected one. Losses of most: nor the predicted one.
         for start, most, wanted in (
             (predicted, _MOST_LOST, levels < all_levels),
@@ -302,7 +363,12 @@ class KltTracker:
             and self._current is not None
             and self._current is not self._reference
         ):
-            refined, good = aligned(self._matches, self._reference, self._current, self._config)
+            refined, good = aligned(
+                self._matches,
+                self._reference,
+                self._current,
+                self._config,
+            )
             self._set(refined, self._unexplained, good)
         self._refined = True
         return self._matches
@@ -333,7 +399,8 @@ class KltTracker:
     # -- inside ------------------------------------------------------------------------------
 
     def _set(self, matches: Matches, unexplained: Array, good: NDArray[np.bool_]) -> None:
-        self._matches, self._unexplained = matches.kept(good), unexplained[good]
+        self._matches = matches.kept(good)
+        self._unexplained = unexplained[good]
 
     def _follow_and_return(
         self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int

@@ -41,7 +41,13 @@ def cut(image: Image, points: Array, radius: int) -> Patches:
     shape, corners = _layout(len(points), side)
     # The unused places of the last row are not read, hence not initialised.
     mosaic = np.empty(shape, dtype=np.uint8)
-    _copy(image, centres - radius, side, corners, mosaic)
+    _copy(
+        image,
+        centres - radius,
+        side,
+        corners,
+        mosaic,
+    )
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
@@ -57,8 +63,17 @@ def cut_warped(
     side = 2 * radius + 1
     shape, corners = _layout(len(points), side)
     # Pixels outside the patches are not read, but need valid coordinates.
-    x, y = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    _maps(points, jacobians, centres - points1, side, corners, x, y)
+    x = np.zeros(shape, dtype=np.float32)
+    y = np.zeros(shape, dtype=np.float32)
+    _maps(
+        points,
+        jacobians,
+        centres - points1,
+        side,
+        corners,
+        x,
+        y,
+    )
     mosaic: Image = cv2.remap(  # type: ignore[assignment]
         image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -79,13 +94,16 @@ def _copy(
 ) -> None:
     height, width = image.shape
     rows, columns = mosaic.shape
-    pixels, target = image.reshape(height * width), mosaic.reshape(rows * columns)
+    pixels = image.reshape(height * width)
+    target = mosaic.reshape(rows * columns)
     for k in range(len(first)):
-        left, top = first[k, 0], first[k, 1]
+        left = first[k, 0]
+        top = first[k, 1]
         at = corners[k, 1] * columns + corners[k, 0]
         if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
             # Indices that cannot be negative: rows are copied many bytes at a time.
-            source, to = np.uint64(top * width + left), np.uint64(at)
+            source = np.uint64(top * width + left)
+            to = np.uint64(at)
             for _ in range(side):
                 for j in range(np.uint64(side)):
                     target[to + j] = pixels[source + j]
@@ -111,13 +129,17 @@ def _maps(
     """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
     radius = side // 2
     for k in range(len(points)):
-        a, c = np.float32(jacobians[k, 0, 0]), np.float32(jacobians[k, 1, 0])
-        column, row = corners[k, 0], corners[k, 1]
+        a = np.float32(jacobians[k, 0, 0])
+        c = np.float32(jacobians[k, 1, 0])
+        column = corners[k, 0]
+        row = corners[k, 1]
         for i in range(side):
-            across, down = offsets[k, 0] - radius, offsets[k, 1] + i - radius
+            across = offsets[k, 0] - radius
+            down = offsets[k, 1] + i - radius
             x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across + jacobians[k, 0, 1] * down)
             y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across + jacobians[k, 1, 1] * down)
-            xs, ys = x[row + i, column : column + side], y[row + i, column : column + side]
+            xs = x[row + i, column : column + side]
+            ys = y[row + i, column : column + side]
             for j in range(side):
                 xs[j] = x0 + a * np.float32(j)
                 ys[j] = y0 + c * np.float32(j)
@@ -126,11 +148,20 @@ def _maps(
 @kernel
 def _squares(image: Image, points: Array, side: int) -> Image:
     """Squares (N, side, side) of pixels from `points` (N, 2), whole numbers, on."""
-    first, corners = np.empty(points.shape, np.int64), np.zeros(points.shape, np.int64)
+    first = np.empty(points.shape, np.int64)
+    corners = np.zeros(points.shape, np.int64)
     for k in range(len(points)):
-        first[k, 0], first[k, 1], corners[k, 1] = int(points[k, 0]), int(points[k, 1]), k * side
+        first[k, 0] = int(points[k, 0])
+        first[k, 1] = int(points[k, 1])
+        corners[k, 1] = k * side
     out = np.empty((len(points) * side, side), dtype=np.uint8)
-    _copy(image, first, side, corners, out)
+    _copy(
+        image,
+        first,
+        side,
+        corners,
+        out,
+    )
     return out.reshape(len(points), side, side)
 
 
@@ -144,7 +175,13 @@ _LANES = 8
 
 
 @kernel
-def correlations(image1: Image, image2: Image, points1: Array, points2: Array, side: int) -> Array:
+def correlations(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    points2: Array,
+    side: int,
+) -> Array:
     """Normalised cross-correlation (N,) of the windows around matched points (N, 2).
 
     Zero where one of the windows is flat; the border is repeated.
@@ -152,26 +189,45 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array, s
     padded = -(-side // _LANES) * _LANES
     window1 = np.zeros((side, padded), dtype=np.float32)
     window2 = np.zeros((side, padded), dtype=np.float32)
-    power1, power2 = np.empty(padded, dtype=np.float32), np.empty(padded, dtype=np.float32)
+    power1 = np.empty(padded, dtype=np.float32)
+    power2 = np.empty(padded, dtype=np.float32)
     product = np.empty(padded, dtype=np.float32)
-    count, pixels = points1.shape[0], side * side
+    count = points1.shape[0]
+    pixels = side * side
     result = np.zeros(count)
-    whole1, whole2 = np.floor(points1), np.floor(points2)
+    whole1 = np.floor(points1)
+    whole2 = np.floor(points2)
     squares1 = _squares(image1, whole1 - side // 2, padded + 1)
     squares2 = _squares(image2, whole2 - side // 2, padded + 1)
     for k in range(count):
-        total1 = _sample(squares1[k], points1[k] - whole1[k], window1, power1)
-        total2 = _sample(squares2[k], points2[k] - whole2[k], window2, power2)
-        mean1, mean2 = np.float32(total1 / pixels), np.float32(total2 / pixels)
-        power1[:], power2[:], product[:] = 0.0, 0.0, 0.0
+        total1 = _sample(
+            squares1[k],
+            points1[k] - whole1[k],
+            window1,
+            power1,
+        )
+        total2 = _sample(
+            squares2[k],
+            points2[k] - whole2[k],
+            window2,
+            power2,
+        )
+        mean1 = np.float32(total1 / pixels)
+        mean2 = np.float32(total2 / pixels)
+        power1[:] = 0.0
+        power2[:] = 0.0
+        product[:] = 0.0
         for i in range(side):
-            row1, row2 = window1[i], window2[i]
+            row1 = window1[i]
+            row2 = window2[i]
             for j in range(padded):
-                off1, off2 = row1[j] - mean1, row2[j] - mean2
+                off1 = row1[j] - mean1
+                off2 = row2[j] - mean2
                 power1[j] += off1 * off1
                 power2[j] += off2 * off2
                 product[j] += off1 * off2
-        total1, total2 = _total(power1, side), _total(power2, side)
+        total1 = _total(power1, side)
+        total2 = _total(power2, side)
         # The variance of a flat window is rounding.
         if total1 > 1e-6 * pixels and total2 > 1e-6 * pixels:
             result[k] = _total(product, side) / math.sqrt(total1 * total2)
@@ -179,24 +235,31 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array, s
 
 
 @kernel
-def _sample(square: Image, shift: Array, window: Window, by_column: Window) -> float:
+def _sample(
+    square: Image,
+    shift: Array,
+    window: Window,
+    by_column: Window,
+) -> float:
     """Fill the `window` (side, padded) from a square of pixels, shifted by part of a pixel.
 
     The sum of its pixels is returned, that of its columns written to `by_column` (padded,).
     """
     side, padded = window.shape
-    dx, dy = shift[0], shift[1]
+    dx = shift[0]
+    dy = shift[1]
     # Weights of the four pixels around a sample: the same for all, as they lie on a grid.
-    w00, w01, w10, w11 = (
-        np.float32((1.0 - dx) * (1.0 - dy)),
-        np.float32(dx * (1.0 - dy)),
-        np.float32((1.0 - dx) * dy),
-        np.float32(dx * dy),
-    )
+    w00 = np.float32((1.0 - dx) * (1.0 - dy))
+    w01 = np.float32(dx * (1.0 - dy))
+    w10 = np.float32((1.0 - dx) * dy)
+    w11 = np.float32(dx * dy)
     by_column[:] = 0.0
     for i in range(side):
-        above, below, row = square[i], square[i + 1], window[i]
-        above1, below1 = above[1:], below[1:]
+        above = square[i]
+        below = square[i + 1]
+        row = window[i]
+        above1 = above[1:]
+        below1 = below[1:]
         for j in range(padded):
             value = (
                 w00 * np.float32(above[j])
@@ -222,7 +285,8 @@ def _total(by_column: Window, side: int) -> float:
 
 # Smaller changes of exposure are not compensated: the second rounding to whole gray levels costs
 # more than it gains at faint texture (a RealSense recording: half the cost of 0.03 and 3).
-_LEAST_GAIN, _LEAST_OFFSET = 0.1, 10.0
+_LEAST_GAIN = 0.1
+_LEAST_OFFSET = 10.0
 
 
 def brightness_table(
@@ -260,14 +324,18 @@ def with_brightness(image: Image, table: Image | None) -> Image:
 @kernel
 def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
     """Mean and standard deviation (N,) of the windows around `points` (N, 2), of whole pixels."""
-    pixels, windows = side * side, _squares(image, np.rint(points) - side // 2, side)
-    mean, deviation = np.empty(len(points)), np.empty(len(points))
+    pixels = side * side
+    windows = _squares(image, np.rint(points) - side // 2, side)
+    mean = np.empty(len(points))
+    deviation = np.empty(len(points))
     for k in range(len(points)):
-        total, squares = np.int64(0), np.int64(0)
+        total = np.int64(0)
+        squares = np.int64(0)
         for i in range(side):
             row = windows[k, i]
             # Integers of 32 bits, which are summed many at a time.
-            row_total, row_squares = np.uint32(0), np.uint32(0)
+            row_total = np.uint32(0)
+            row_squares = np.uint32(0)
             for j in range(side):
                 value = np.uint32(row[j])
                 row_total += value
