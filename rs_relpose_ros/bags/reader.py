@@ -3,30 +3,27 @@
 A bag that is damaged, truncated or far too large raises an InputError with one line of text.
 """
 
-import bz2
+from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 import functools
 import logging
-import os
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, BinaryIO, NamedTuple
+import struct
+from typing import Any, NamedTuple
 
-from lz4.frame import LZ4FrameDecompressor
-from rosbags.convert.converter import LATCH
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag1 import reader as rosbag1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2 import reader as rosbag2
-from rosbags.rosbag2 import storage_mcap as mcap
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import QosReliability
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
-import yaml
 
-from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.bags import storage
+from rs_relpose_ros.bags.files import damage, open_files, OpenFiles
+from rs_relpose_ros.bags.order import reading_order
+from rs_relpose_ros.bags.storage import message_data, StoredTopic
+from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Topics and frames of the bags that the project writes.
@@ -53,121 +50,7 @@ CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 IMU = 'sensor_msgs/msg/Imu'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
-_STORAGE_SUFFIXES = ('.mcap', '.db3')
-
 _logger = logging.getLogger(__name__)
-
-# -- Bounds: rosbags has none, and a few bytes can decompress to any size -------------------------
-
-# Bytes of the largest chunk that is decompressed; recorders write chunks of megabytes.
-MAX_CHUNK_BYTES = 1 << 30
-# Bytes of the largest message that is decoded: above any accepted image (64 Mpx, 4 channels).
-MAX_MESSAGE_BYTES = 1 << 29
-# A compressed storage file is decompressed to a temporary one of at most this and so many times
-# its size.
-MAX_FILE_BYTES = 1 << 30
-_MAX_FILE_GROWTH = 200
-# Bytes of the largest metadata.yaml that is parsed; thousands of topics need less.
-_MAX_METADATA_BYTES = 1 << 24
-
-# The zstd module that rosbags uses: Python's own from 3.14 on, a package before.
-_zstd: Any = vars(mcap)['zstd']
-
-
-@contextmanager
-def _bounded_file(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
-    """Open a zstd file that can be read up to a bounded size; called by rosbags."""
-    size = os.fstat(file.fileno()).st_size
-    limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * size
-    count = 0
-    with _zstd.open(file, mode) as stream:
-
-        def read(most: int) -> bytes:
-            nonlocal count
-            data: bytes = stream.read(most)
-            count += len(data)
-            if count > limit:
-                raise InputError(f'{size} bytes decompress to more than {limit}')
-            return data
-
-        yield SimpleNamespace(read=read)
-
-
-def _decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:
-    """Decompress one frame of at most `limit` bytes."""
-    stream = decompressor()
-    # One byte more: at exactly the limit the end of the frame may not be reached.
-    out: bytes = stream.decompress(data, limit + 1)
-    if len(out) > limit:
-        raise InputError(f'{len(data)} bytes decompress to more than {limit}')
-    if not stream.eof:
-        raise InputError(f'{len(data)} compressed bytes are incomplete')
-    return out
-
-
-def _chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
-    # MCAP gives the size of a chunk, ROS 1 does not.
-    return lambda data, *size: _decompressed(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
-
-
-# Replaced for all bags that this process reads: rosbags has no setting. Without such an entry in
-# the tables of its version nothing would be bounded.
-_TABLES: Any = (
-    (mcap.DECOMPRESSORS, 'zstd', _chunk(_zstd.ZstdDecompressor)),
-    (mcap.DECOMPRESSORS, 'lz4', _chunk(LZ4FrameDecompressor)),
-    (rosbag1.decompressors, 'lz4', _chunk(LZ4FrameDecompressor)),
-    (rosbag1.decompressors, 'bz2', _chunk(bz2.BZ2Decompressor)),
-    (
-        vars(rosbag2),
-        'zstd',
-        SimpleNamespace(
-            open=_bounded_file,
-            decompress=lambda data: _decompressed(_zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES),
-        ),
-    ),
-)
-for _table, _name, _bounded in _TABLES:
-    if _name not in _table:
-        raise ImportError(f'rosbags decompresses {_name} in another way than 0.11 does')
-    _table[_name] = _bounded
-
-
-# -- Checks before a parser reads the files -------------------------------------------------------
-
-
-def _check_path(path: Path) -> None:
-    """Raise where there is no bag, or one without usable metadata."""
-    if not path.exists():
-        raise MissingInputError(f'there is no bag at {path}')
-    if not path.is_dir():
-        if path.suffix not in (*_STORAGE_SUFFIXES, '.bag'):
-            raise InputError(
-                f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or '
-                'a .mcap, .db3 or .bag file'
-            )
-        return
-    metadata = path / 'metadata.yaml'
-    if not metadata.exists():
-        for file in sorted(path.iterdir()):
-            if file.suffix in _STORAGE_SUFFIXES:
-                raise InputError(
-                    f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
-                    f'{file.name} itself, or make one with "ros2 bag reindex {path}"'
-                )
-        raise InputError(f'{path} is no bag: it has no metadata.yaml')
-    if metadata.stat().st_size > _MAX_METADATA_BYTES:
-        raise InputError(
-            f'{metadata} is no metadata of a bag: it has more than {_MAX_METADATA_BYTES} bytes'
-        )
-    content = metadata.read_bytes()
-    with suppress(yaml.YAMLError, RecursionError):  # no YAML: refused by the reader
-        # Printed, aliases can be endless.
-        if b'*' in content and any(
-            isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)
-        ):
-            raise InputError(
-                f'{metadata} has YAML aliases, which no recorder writes: it is damaged'
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,67 +233,79 @@ def _type_hash(msgtype: str, of_ros2: bool) -> str:
     return store.hash_rihs01(msgtype) if of_ros2 else store.generate_msgdef(msgtype)[1]
 
 
+class Timeline(NamedTuple):
+    """Times of the messages of a topic in the order of the file [ns]."""
+
+    stamps: NDArray[np.int64]
+    received: NDArray[np.int64]
+
+
+class _Index(NamedTuple):
+    """Places of messages in the files of a bag, in their order; arrays of int64 (N,)."""
+
+    topic: NDArray[np.int64]  # number of its name and type in the bag
+    file: NDArray[np.int64]
+    place: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    received: NDArray[np.int64]  # [ns]
+    stamp: NDArray[np.int64]  # of the header; for types without a header, the time of reception
+
+
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, reader: Reader1 | Reader2) -> None:
+    def __init__(self, path: Path, files: OpenFiles) -> None:
         self.path = path
-        self._reader = reader
-        self._is_ros2 = isinstance(reader, Reader2)
+        self._files, self._storages = files.files, files.storages
         # Gets the topic of each message that is read, for a progress bar.
         self.on_message: Callable[[str], object] = lambda topic: None
         counts: dict[tuple[str, str], int] = {}
-        self._by_topic: dict[tuple[str, str], Connection] = {}
-        # Typed, but metadata is YAML: any value can be of any type.
-        connections: Any = reader.connections
-        for connection in connections:
-            if not (
-                isinstance(connection.topic, str)
-                and connection.topic.isprintable()
-                and isinstance(connection.msgtype, str)
-                and connection.msgtype.isprintable()
-                and isinstance(connection.msgcount, int)
-            ):
-                raise InputError(
-                    f'{path} is damaged: in its metadata, name, type or number of '
-                    'messages of a topic is invalid'
-                )
-            key = connection.topic, connection.msgtype
-            self._by_topic.setdefault(key, connection)
-            counts[key] = counts.get(key, 0) + connection.msgcount
+        self._stored: dict[tuple[str, str], StoredTopic] = {}
+        for opened in self._storages:
+            for topic in opened.topics:
+                key = topic.name, topic.msgtype
+                if not ''.join(key).isprintable():
+                    raise InputError(f'{path} is damaged: a topic has no printable name or type')
+                digest = topic.digest or files.metadata.digests.get(key, '')
+                self._stored.setdefault(key, topic._replace(digest=digest))
+                counts[key] = counts.get(key, 0) + topic.messages
+        self._numbers = {key: number for number, key in enumerate(self._stored)}
         self.topics = tuple(
             Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items())
         )
+        ends = [s for s in self._storages if any(topic.messages for topic in s.topics)]
         # Time from the first to the last message [s].
-        self.duration = float(reader.duration) / NANOSECONDS
+        self.duration = 0.0
+        if ends:
+            first, last = min(s.start_ns for s in ends), max(s.end_ns for s in ends)
+            self.duration = (last + 1 - first) / NANOSECONDS
 
     def reliability(self, topic: Topic) -> str:
         """``'reliable'`` or ``'best effort'`` as its publishers offered; empty if not recorded."""
-        offered = {
-            profile.reliability
-            for connection in self._connections([topic])
-            if isinstance(connection.ext, ConnectionExtRosbag2)
-            for profile in connection.ext.offered_qos_profiles
-        }
+        stored = self._stored[topic.name, topic.msgtype]
+        if stored.encoding != 'cdr':
+            return ''
+        offered = {profile.reliability for profile in stored.qos}
         if QosReliability.BEST_EFFORT in offered:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def origin(self, topic: Topic) -> dict[str, Any]:
         """Metadata for a copy of a topic, in ROS 2, as rosbags' `add_connection` takes them."""
-        connection = self._connections([topic])[0]
-        if not isinstance(connection.ext, ConnectionExtRosbag2):
-            return {'msgdef': '', 'offered_qos_profiles': LATCH if connection.ext.latching else ()}
+        stored = self._stored[topic.name, topic.msgtype]
+        if stored.encoding != 'cdr':
+            return {'msgdef': '', 'offered_qos_profiles': stored.qos}
         return {
-            'msgdef': connection.msgdef.data,
-            'rihs01': connection.digest,
-            'serialization_format': connection.ext.serialization_format,
-            'offered_qos_profiles': connection.ext.offered_qos_profiles,
+            'msgdef': stored.definition,
+            'rihs01': stored.digest,
+            'serialization_format': stored.encoding,
+            'offered_qos_profiles': stored.qos,
         }
 
     def can_be_copied(self, topic: Topic) -> bool:
         """Whether `raw_messages` can read it: of ROS 1 only types that ROS 2 has, too."""
-        return self._is_ros2 or topic.msgtype in _types(of_ros2=True).fielddefs
+        stored = self._stored[topic.name, topic.msgtype]
+        return stored.encoding == 'cdr' or topic.msgtype in _types(of_ros2=True).fielddefs
 
     def find_topics(
         self, names: Mapping[str, str] | None = None, *, needs_camera_info: bool = True
@@ -431,72 +326,167 @@ class Bag:
         """The same, but None for those that are absent; a rectified image is chosen, too."""
         return _TopicFinder(self.path, self.topics, names, complete=False).find(False)
 
-    def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
-        """Messages of `topics` in the order of bag time, with arrays that are read-only."""
-        for raw in self.raw_messages(topics):
+    def messages(self, topics: Sequence[Topic], *, by_stamp: bool = False) -> Iterator[BagMessage]:
+        """Messages of `topics` in the order of `raw_messages`, with arrays that are read-only."""
+        for raw in self.raw_messages(topics, by_stamp=by_stamp):
             yield BagMessage(raw.topic, raw.bag_time_ns, self.read(raw))
 
-    def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
-        """Messages of `topics` in the order of bag time, in CDR as publishers expect them."""
-        # Of ROS 2, not of the bag: headers of ROS 1 have an additional number.
-        typestore = _types(of_ros2=True)
-        for connection, bag_time_ns, data in self._raw(topics):
-            if not self._is_ros2:
-                if connection.msgtype not in typestore.fielddefs:
-                    raise InputError(
-                        f'topic {connection.topic} of {self.path} is of type '
-                        f'{connection.msgtype}, which ROS 2 does not have: leave it '
-                        'out'
-                    )
-                data = bytes(self._decoded(connection, typestore.ros1_to_cdr, data))
-            yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, data)
+    def raw_messages(
+        self, topics: Sequence[Topic], *, by_stamp: bool = False
+    ) -> Iterator[RawMessage]:
+        """Messages of `topics` in CDR as publishers of ROS 2 expect them.
+
+        They come in the order in which they were received, or `by_stamp` in the order of
+        `reading_order`, the first CameraInfo before all others.
+        """
+        index = self._index(topics)
+        order = np.argsort(index.received, kind='stable')
+        if by_stamp:
+            order = self._by_stamp(index)
+        stored = list(self._stored.values())
+        columns = (index.topic, index.file, index.place, index.offset, index.received)
+        for row in order:
+            number, file, place, offset, received = (int(column[row]) for column in columns)
+            topic = stored[number]
+            data = self._as_cdr(topic, self._data(file, place, offset))
+            self.on_message(topic.name)
+            yield RawMessage(topic.name, topic.msgtype, received, data)
+
+    def timeline(self, topic: Topic) -> Timeline:
+        """Stamps and times of reception of a topic."""
+        index = self._index([topic])
+        return Timeline(index.stamp, index.received)
 
     def read(self, raw: RawMessage) -> Any:
         """The ROS 2 message of an item of `raw_messages`; InputError if it cannot be decoded."""
-        connection = self._by_topic[raw.topic, raw.msgtype]
-        return self._decoded(connection, _types(of_ros2=True).deserialize_cdr, raw.data)
+        stored = self._stored[raw.topic, raw.msgtype]
+        return self._decoded(stored, _types(of_ros2=True).deserialize_cdr, raw.data)
 
-    def _connections(self, topics: Sequence[Topic]) -> list[Connection]:
-        chosen = {(topic.name, topic.msgtype) for topic in topics}
-        return [c for c in self._reader.connections if (c.topic, c.msgtype) in chosen]
+    # -- places and order --------------------------------------------------------------------
 
-    def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
-        connections = self._connections(topics)
-        if not connections:
-            return
+    def _index(self, topics: Sequence[Topic]) -> _Index:
+        """Places of the messages of `topics`."""
+        numbers = [self._numbers[topic.name, topic.msgtype] for topic in topics]
+        whole = self._whole_index
+        chosen = np.isin(whole.topic, numbers)
+        return _Index(*(column[chosen] for column in whole))
+
+    @functools.cached_property
+    def _whole_index(self) -> _Index:
+        """Places of all messages, which the first reading collects."""
+        columns = [array('q') for _ in _Index._fields]
+        stored = list(self._stored.values())
+        has_header = [_begins_with_header(topic) for topic in stored]
+        for number, opened in enumerate(self._storages):
+            keys = {topic.id: self._numbers[topic.name, topic.msgtype] for topic in opened.topics}
+            entries = self._guarded(number, opened.entries())
+            for topic_id, received, place, offset, data in entries:
+                topic = keys[topic_id]
+                stamp = _stamp_of(data) if has_header[topic] else received
+                row = topic, number, place, offset, received, stamp
+                for column, value in zip(columns, row, strict=True):
+                    column.append(value)
+        return _Index(*(np.frombuffer(column, np.int64) for column in columns))
+
+    def _by_stamp(self, index: _Index) -> NDArray[np.int64]:
+        """Order of reading, with a CameraInfo at the beginning where there is one."""
+        of_type = {
+            msgtype: [n for (_, kind), n in self._numbers.items() if kind == msgtype]
+            for msgtype in (*_MEASURED, CAMERA_INFO)
+        }
+        sensors = [number for msgtype in _MEASURED for number in of_type[msgtype]]
+        order = reading_order(index.stamp, index.topic, sensors)
+        infos = np.flatnonzero(np.isin(index.topic[order], of_type[CAMERA_INFO]))
+        if len(infos):
+            # It serves the images before it, too: drivers publish it late, or once.
+            first = infos[0]
+            order = np.concatenate((order[first : first + 1], np.delete(order, first)))
+        return order
+
+    # -- data --------------------------------------------------------------------------------
+
+    def _guarded(self, number: int, values: Iterator[Any]) -> Iterator[Any]:
+        """Items of a parser; whatever damaged bytes raise becomes an InputError."""
         try:
-            for connection, bag_time_ns, data in self._reader.messages(connections):
-                if len(data) > MAX_MESSAGE_BYTES:
-                    raise InputError(
-                        f'a message of {connection.topic} has {len(data)} bytes; at '
-                        f'most {MAX_MESSAGE_BYTES} are read'
-                    )
-                self.on_message(connection.topic)
-                yield connection, bag_time_ns, data
-        # A damaged file can raise anything in the parsers.
+            yield from values
+        except MemoryError:
+            raise
         except Exception as error:
-            raise InputError(f'{self.path} is damaged: {_message(error)}') from error
+            raise self._damage(number, error) from error
 
-    def _decoded(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
-        """Decode a message, unless its type had other fields in the ROS of the recorder."""
-        if (
-            connection.msgtype in _types(self._is_ros2).fielddefs
-            and connection.digest
-            and connection.digest != _type_hash(connection.msgtype, self._is_ros2)
-        ):
-            name = 'ROS 2 Jazzy' if self._is_ros2 else 'ROS 1 Noetic'
+    def _data(self, number: int, place: int, offset: int) -> bytes:
+        try:
+            return message_data(self._storages[number].data(place, offset))
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise self._damage(number, error) from error
+
+    def _damage(self, number: int, error: Exception) -> InputError:
+        return damage(self.path, self._files[number], error)
+
+    def _as_cdr(self, topic: StoredTopic, data: bytes) -> bytes:
+        """The data of a message in CDR of ROS 2: headers of ROS 1 have an additional number."""
+        if len(data) > storage.MAX_MESSAGE_BYTES:
             raise InputError(
-                f'topic {connection.topic} of {self.path} is of another '
-                f'{connection.msgtype} than that of {name}: its type hash is '
-                f'{str(connection.digest)[:80]!r}'
+                f'a message of {topic.name} has {len(data)} bytes; at most '
+                f'{storage.MAX_MESSAGE_BYTES} are read'
+            )
+        if topic.encoding == 'cdr':
+            return data
+        known = _types(of_ros2=True)
+        if topic.encoding != 'ros1':
+            raise InputError(
+                f'topic {topic.name} of {self.path} is encoded as {topic.encoding[:20]!r}: only '
+                'messages of ROS can be read'
+            )
+        if topic.msgtype not in known.fielddefs:
+            raise InputError(
+                f'topic {topic.name} of {self.path} is of type {topic.msgtype}, which ROS 2 does '
+                'not have: leave it out'
+            )
+        return bytes(self._decoded(topic, known.ros1_to_cdr, data))
+
+    def _decoded(self, topic: StoredTopic, decode: Callable[..., Any], data: bytes) -> Any:
+        """Decode a message, unless its type had other fields in the ROS of the recorder."""
+        of_ros2 = topic.encoding == 'cdr'
+        known = topic.digest and topic.msgtype in _types(of_ros2).fielddefs
+        if known and topic.digest != _type_hash(topic.msgtype, of_ros2):
+            name = 'ROS 2 Jazzy' if of_ros2 else 'ROS 1 Noetic'
+            raise InputError(
+                f'topic {topic.name} of {self.path} is of another {topic.msgtype} than that '
+                f'of {name}: its type hash is {topic.digest[:80]!r}'
             )
         try:
-            return decode(data, connection.msgtype)
+            return decode(data, topic.msgtype)
         except Exception as error:
+            _logger.debug('raised here', exc_info=True)
             raise InputError(
-                f'a message of {connection.topic} in {self.path} is corrupt, it is no '
-                f'{connection.msgtype}: {_message(error)}'
+                f'a message of {topic.name} in {self.path} is corrupt, it is no {topic.msgtype}'
             ) from error
+
+
+# Types of the sensors whose clocks decide the order of reading.
+_MEASURED = (IMAGE, COMPRESSED_IMAGE, IMU)
+# Bytes before the stamp of a message with a header: kind of the encoding, or in ROS 1 a number.
+_BEFORE_STAMP = 4
+_STAMP = struct.Struct('<iI')
+
+
+def _begins_with_header(topic: StoredTopic) -> bool:
+    known = _types(topic.encoding == 'cdr').fielddefs
+    fields = known[topic.msgtype][1] if topic.msgtype in known else []
+    return bool(fields) and 'std_msgs/msg/Header' in str(fields[0])
+
+
+def _stamp_of(data: bytes | memoryview) -> int:
+    """Stamp [ns] of the header that a message begins with; 0 where it is too short for one."""
+    if data[:4] == storage.ZSTD_MAGIC:
+        data = storage.first_bytes(data, _BEFORE_STAMP + 8)
+    if len(data) < _BEFORE_STAMP + 8:
+        return 0
+    seconds, nanoseconds = _STAMP.unpack_from(data, _BEFORE_STAMP)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
 @contextmanager
@@ -505,28 +495,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     path = Path(path)
     with ExitStack() as stack:
         try:
-            _check_path(path)
-            reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
-            stack.enter_context(reader)
-            bag = Bag(path, reader)
-        except RsRelposeError:
-            raise
+            bag = Bag(path, open_files(path, stack))
         except PermissionError as error:
             raise InputError(f'{path} cannot be read: {error.strerror}') from error
-        # A damaged file can raise anything in the parsers.
-        except Exception as error:
-            storage = next(path.glob('*.mcap'), path)
-            fix = {
-                '.bag': f'; try "rosbag reindex {path.name}"',
-                '.mcap': '; if it is truncated, copy it again, or "mcap recover '
-                f'{storage.name} -o recovered.mcap"',
-            }.get(storage.suffix, '')
-            kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
-            raise InputError(f'{path} {kind}: {_message(error)}{fix}') from error
         yield bag
-
-
-def _message(error: Exception) -> str:
-    """Text of a parser's error in one line, without its full stop; else its type."""
-    text = ' '.join(str(error).split()).rstrip('.')
-    return text[:300] if text else type(error).__name__

@@ -1,0 +1,273 @@
+"""The files that make a bag, and how they are opened: with metadata.yaml, or without it.
+
+The topics and the number of their messages are read from the files themselves. Of metadata.yaml
+only the list of the files, their times and the hashes of the types are used, so that a bag whose
+recorder was killed, or whose files were renamed, can be read.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+import logging
+from pathlib import Path, PurePath
+import re
+import tempfile
+from typing import Any, NamedTuple
+
+import yaml
+
+from rs_relpose_ros.bags.mcap import McapStorage
+from rs_relpose_ros.bags.ros1 import Ros1Storage
+from rs_relpose_ros.bags.sqlite import SqliteStorage
+from rs_relpose_ros.bags.storage import (
+    DamagedError,
+    Source,
+    Storage,
+    UnfinishedError,
+    zstd,
+)
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+_SUFFIXES = ('.mcap', '.db3', '.bag')
+_METADATA = 'metadata.yaml'
+# Bytes of the largest metadata.yaml that is parsed. A larger one is ignored; parsing it would take
+# minutes. [chosen: thousands of topics need less than a megabyte]
+_MAX_METADATA_BYTES = 1 << 24
+# A compressed file is decompressed to a temporary one of at most this size [bytes] and so many
+# times its own. Without a bound a file of some kilobytes would fill the disk; a smaller one would
+# refuse recordings that compress well. [chosen: images of noise-free simulations reach 100 times]
+MAX_FILE_BYTES = 1 << 30
+_MAX_FILE_GROWTH = 200
+# Bytes that are decompressed at once. [chosen: 64 kB to 64 MB]
+_BLOCK = 1 << 20
+
+_logger = logging.getLogger(__name__)
+
+
+class Metadata(NamedTuple):
+    """What metadata.yaml says; all empty where there is none that can be used."""
+
+    files: tuple[str, ...]
+    digests: dict[tuple[str, str], str]  # hash of each topic's type, by topic and type
+    parts: dict[str, tuple[float, float, int]]  # start [s], duration [s], messages of a file
+
+
+_NOTHING = Metadata((), {}, {})
+
+
+class OpenFiles(NamedTuple):
+    """The open files of a bag in their order."""
+
+    files: list[Path]
+    storages: list[Storage]
+    metadata: Metadata
+
+
+def open_files(path: Path, stack: ExitStack) -> OpenFiles:
+    """Open the file, or the files of the folder; the stack closes them."""
+    if not path.exists():
+        raise MissingInputError(f'there is no bag at {path}')
+    metadata = _NOTHING
+    files = [path]
+    if path.is_dir():
+        metadata = _read_metadata(path / _METADATA)
+        files = _files_of(path, metadata)
+    return OpenFiles(files, [_open(file, path, stack) for file in files], metadata)
+
+
+def damage(path: Path, file: Path, error: Exception) -> InputError:
+    """The error of a file of the bag at `path` with what may help."""
+    # What the parsers of damaged bytes raise helps nobody: it names places of this code.
+    _logger.debug('raised here', exc_info=error)
+    reason = str(error) if isinstance(error, DamagedError) else 'its records have no sense'
+    if isinstance(error, UnfinishedError):
+        return InputError(f'{path}: {reason}')
+    kind = 'is truncated or damaged, or no bag' if path == file else f'is damaged: {file.name}'
+    remedies = {
+        '.mcap': f'if it is truncated, copy it again, or "mcap recover {file.name} -o whole.mcap"',
+        '.db3': f'copy it again, or "sqlite3 {file.name} .recover | sqlite3 whole.db3"',
+        '.bag': f'copy it again, or "rosbag reindex {file.name}" in ROS 1',
+    }
+    remedy = remedies.get(file.suffix, 'copy it again')
+    return InputError(f'{path} {kind}: {reason}; {remedy}')
+
+
+# -- metadata.yaml --------------------------------------------------------------------------------
+
+
+def _read_metadata(file: Path) -> Metadata:
+    """Read what can be used; a warning says why nothing can."""
+    if not file.exists():
+        return _NOTHING
+    found: Any = None
+    problem = 'is no metadata of a bag'
+    if file.stat().st_size > _MAX_METADATA_BYTES:
+        problem = f'has more than {_MAX_METADATA_BYTES} bytes'
+    else:
+        with suppress(yaml.YAMLError, RecursionError, UnicodeDecodeError):
+            text = file.read_text(encoding='utf-8')
+            # Aliases of aliases have no end when they are printed or merged.
+            if '*' in text and any(isinstance(e, yaml.AliasEvent) for e in yaml.parse(text)):
+                problem = 'has YAML aliases, which no recorder writes'
+            else:
+                found = yaml.safe_load(text)
+        problem = problem if file.stat().st_size else 'is empty'
+    with suppress(KeyError, TypeError, AttributeError, ValueError):
+        return _metadata_of(found['rosbag2_bagfile_information'])
+    _logger.warning(
+        '%s %s: the bag is read without it; "ros2 bag reindex %s" writes a new one',
+        file,
+        problem,
+        file.parent,
+    )
+    return _NOTHING
+
+
+def _metadata_of(information: Any) -> Metadata:
+    names = tuple(PurePath(str(name)).name for name in information['relative_file_paths'])
+    digests = {}
+    for topic in information.get('topics_with_message_count') or ():
+        described = topic['topic_metadata']
+        digest = str(described.get('type_description_hash') or '')
+        digests[str(described['name']), str(described['type'])] = digest
+    parts = {}
+    for part in information.get('files') or ():
+        start, duration = part['starting_time'], part['duration']
+        parts[PurePath(str(part['path'])).name] = (
+            start['nanoseconds_since_epoch'] / NANOSECONDS,
+            duration['nanoseconds'] / NANOSECONDS,
+            int(part['message_count']),
+        )
+    return Metadata(names, digests, parts)
+
+
+# -- The files of a folder ------------------------------------------------------------------------
+
+
+def _files_of(folder: Path, metadata: Metadata) -> list[Path]:
+    """The files in the order of recording; InputError where one is missing."""
+    there = sorted(_storage_files(folder), key=_natural)
+    listed = [folder / name for name in metadata.files]
+    missing = [file for file in listed if not file.is_file()]
+    if listed and not missing:
+        return listed
+    if not there:
+        if metadata.files:
+            raise InputError(
+                f'{folder} is damaged: {" and ".join(metadata.files)}, which its {_METADATA} '
+                'names, is not there: copy it again'
+            )
+        raise InputError(f'{folder} is no bag: it has no {_METADATA} and no {_or(_SUFFIXES)} file')
+    if not listed:
+        if not (folder / _METADATA).exists():
+            _logger.warning(
+                '%s has no %s, so its recorder was not stopped properly: the bag is read without '
+                'it; "ros2 bag reindex %s" writes one',
+                folder,
+                _METADATA,
+                folder,
+            )
+        return there
+    others = [file for file in there if file not in listed]
+    if len(others) == len(missing):
+        _logger.warning(
+            '%s names %s, and %s is there: it is read as a renamed file; "ros2 bag reindex %s" '
+            'writes the new name',
+            folder / _METADATA,
+            _and(file.name for file in missing),
+            _and(file.name for file in others),
+            folder,
+        )
+        return there
+    raise InputError(
+        f'{folder} is not complete: of its {len(listed)} files '
+        f'{_and(_described(file, metadata) for file in missing)} is missing: copy it there, or '
+        f'go on without it after "ros2 bag reindex {folder}"'
+    )
+
+
+def _storage_files(folder: Path) -> Iterator[Path]:
+    for file in folder.iterdir():
+        name = file.name.removesuffix('.zstd')
+        if file.is_file() and name.endswith(_SUFFIXES):
+            yield file
+
+
+def _natural(file: Path) -> list[Any]:
+    """Key that sorts run_2 before run_10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)]
+
+
+def _described(file: Path, metadata: Metadata) -> str:
+    if file.name not in metadata.parts:
+        return file.name
+    start, duration, count = metadata.parts[file.name]
+    begin = min(start for start, _, _ in metadata.parts.values())
+    return f'{file.name} ({duration:.1f} s from {start - begin:.1f} s on, {count} messages)'
+
+
+def _and(names: Any) -> str:
+    return ' and '.join(names)
+
+
+def _or(names: Any) -> str:
+    return ' or '.join(names)
+
+
+# -- One file -------------------------------------------------------------------------------------
+
+
+def _open(file: Path, path: Path, stack: ExitStack) -> Storage:
+    """Open a file of the bag at `path` by what its first bytes say."""
+    try:
+        source = _source(file, path)
+        unpacked = _unpacked(file, stack) if source is Source.ZSTD else file
+        source = _source(unpacked, path)
+        storage: Storage
+        if source is Source.MCAP:
+            storage = McapStorage(unpacked)
+        elif source is Source.SQLITE:
+            storage = SqliteStorage(unpacked)
+        elif source is Source.ROS1:
+            storage = Ros1Storage(unpacked)
+        else:
+            raise DamagedError('it begins as no bag does')
+    except (MissingInputError, PermissionError, MemoryError):
+        raise
+    # Damaged bytes can raise anything in the parsers.
+    except Exception as error:
+        if isinstance(error, InputError) and not isinstance(error, DamagedError):
+            raise
+        raise damage(path, file, error) from error
+    stack.callback(storage.close)
+    return storage
+
+
+def _source(file: Path, path: Path) -> Source | None:
+    with file.open('rb') as opened:
+        begin = opened.read(16)
+    for source in Source:
+        if begin.startswith(source.value):
+            return source
+    if file == path and file.suffix not in (*_SUFFIXES, '.active'):
+        raise InputError(
+            f'{path} is no bag: give a rosbag2 directory (with {_METADATA}) or '
+            'a .mcap, .db3 or .bag file'
+        )
+    return None
+
+
+def _unpacked(file: Path, stack: ExitStack) -> Path:
+    """Decompress a file to a temporary one of bounded size."""
+    folder = stack.enter_context(tempfile.TemporaryDirectory())
+    unpacked = Path(folder, file.name.removesuffix('.zstd'))
+    size = file.stat().st_size
+    limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * size
+    count = 0
+    with zstd.open(file, 'rb') as packed, unpacked.open('wb') as out:
+        while block := packed.read(_BLOCK):
+            count += len(block)
+            if count > limit:
+                raise DamagedError(f'{size} bytes decompress to more than {limit}')
+            out.write(block)
+    return unpacked

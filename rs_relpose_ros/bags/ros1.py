@@ -1,0 +1,198 @@
+"""Read ROS 1 bags, version 2.0: http://wiki.ros.org/Bags/Format/2.0."""
+
+from collections import Counter
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import struct
+
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+
+from rs_relpose_ros.bags.storage import (
+    chunk_data,
+    DamagedError,
+    Entry,
+    KeptChunks,
+    MAX_CHUNK_BYTES,
+    StoredTopic,
+    UnfinishedError,
+)
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+_MAGIC = b'#ROSBAG V2.0\n'
+_MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
+_LENGTH = struct.Struct('<I')
+_PLACE = struct.Struct('<Q')
+_TIME = struct.Struct('<II')
+_COUNT = struct.Struct('<II')  # connection, number of its messages in a chunk
+# Bytes of the largest header of a record that is read. [chosen: that of a connection holds a
+# topic's name, the others less than 100 bytes]
+_MAX_HEADER = 1 << 16
+_FOREVER = QosTime(2147483647, 4294967295)
+# QoS in ROS 2 of a topic whose publisher has latched its last message, as `rosbags-convert` has
+# it.
+LATCHED = Qos(
+    QosHistory.UNKNOWN,
+    0,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    _FOREVER,
+    _FOREVER,
+    QosLiveliness.AUTOMATIC,
+    _FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+
+
+class Ros1Storage:
+    """An open ROS 1 bag; see `Storage`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open('rb', buffering=0)
+        self._chunks = KeptChunks(self._load_chunk)
+        self._places: list[int] = []
+        self._counts: Counter[int] = Counter()
+        self.topics: list[StoredTopic] = []
+        self.start_ns = self.end_ns = 0
+        try:
+            if self._read(0, len(_MAGIC)) != _MAGIC:
+                raise DamagedError('only version 2.0 of ROS 1 bags can be read')
+            fields, _, _ = self._record(len(_MAGIC))
+            (index,) = _PLACE.unpack(fields['index_pos'])
+            size = os.fstat(self._file.fileno()).st_size
+            # rosbag renames a file when it closes it.
+            if index == 0 or (index >= size and path.suffix == '.active'):
+                raise UnfinishedError(
+                    f'its recorder has not closed it: "rosbag reindex {path.name}" in ROS 1 does'
+                )
+            self._read_index(index, size)
+            counted = _LENGTH.unpack(fields['conn_count']), _LENGTH.unpack(fields['chunk_count'])
+            if counted != ((len(self.topics),), (len(self._places),)):
+                raise DamagedError('its index is not complete')
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def entries(self) -> Iterator[Entry]:
+        """All messages in the order of the file."""
+        known = {topic.id for topic in self.topics}
+        for place in self._places:
+            chunk = self._chunks[place]
+            start = 0
+            while start < len(chunk):
+                fields, data, start = _record_of(chunk, start)
+                if fields['op'][0] != _MESSAGE:
+                    continue
+                (connection,) = _LENGTH.unpack(fields['conn'])
+                if connection not in known:
+                    raise DamagedError(f'a message belongs to the unknown connection {connection}')
+                content = memoryview(chunk)[data:start]
+                yield Entry(connection, _nanoseconds(fields['time']), place, data, content)
+
+    def data(self, place: int, offset: int) -> bytes:
+        """Bytes of the message of an entry."""
+        chunk = self._chunks[place]
+        (size,) = _LENGTH.unpack_from(chunk, offset - _LENGTH.size)
+        return chunk[offset : offset + size]
+
+    def _read(self, start: int, size: int) -> bytes:
+        if size > MAX_CHUNK_BYTES:
+            raise DamagedError(f'a record has {size} bytes')
+        data = os.pread(self._file.fileno(), size, start)
+        if len(data) < size:
+            raise DamagedError('it ends within a record')
+        return data
+
+    def _record(self, start: int) -> tuple[dict[str, bytes], int, int]:
+        """Fields of the header of a record in the file, start of its data, and their size."""
+        (length,) = _LENGTH.unpack(self._read(start, _LENGTH.size))
+        if length > _MAX_HEADER:
+            raise DamagedError('a header has no end')
+        header = self._read(start + _LENGTH.size, length + _LENGTH.size)
+        (size,) = _LENGTH.unpack_from(header, length)
+        return _fields(header[:length]), start + length + 2 * _LENGTH.size, size
+
+    def _read_index(self, start: int, end: int) -> None:
+        """Read the connections and the places of the chunks, which stand at the end."""
+        connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
+        times: list[int] = []
+        while start < end:
+            fields, data, size = self._record(start)
+            start = data + size
+            if fields['op'][0] == _CONNECTION:
+                content = _fields(self._read(data, size))
+                connections[_LENGTH.unpack(fields['conn'])[0]] = fields, content
+            elif fields['op'][0] == _CHUNK_INFO:
+                self._places.append(_PLACE.unpack(fields['chunk_pos'])[0])
+                for connection, count in _COUNT.iter_unpack(self._read(data, size)):
+                    self._counts[connection] += count
+                times += [_nanoseconds(fields['start_time']), _nanoseconds(fields['end_time'])]
+        self._places.sort()
+        self.start_ns, self.end_ns = (min(times), max(times)) if times else (0, 0)
+        for number, (head, content) in connections.items():
+            package, _, name = content['type'].decode().rpartition('/')
+            self.topics.append(
+                StoredTopic(
+                    number,
+                    _normalised(head['topic'].decode()),
+                    f'{package}/msg/{name}',
+                    self._counts[number],
+                    'ros1',
+                    content['md5sum'].decode(),
+                    content['message_definition'].decode(errors='replace'),
+                    (LATCHED,) if content.get('latching') == b'1' else (),
+                )
+            )
+
+    def _load_chunk(self, start: int) -> bytes:
+        fields, data, size = self._record(start)
+        if fields['op'][0] != _CHUNK:
+            raise DamagedError('its index names a chunk where there is none')
+        (whole,) = _LENGTH.unpack(fields['size'])
+        return chunk_data(self._read(data, size), fields['compression'].decode(), whole)
+
+
+def _record_of(chunk: bytes, start: int) -> tuple[dict[str, bytes], int, int]:
+    """Fields of the header of a record in a chunk, and start and end of its data."""
+    (length,) = _LENGTH.unpack_from(chunk, start)
+    header = start + _LENGTH.size
+    data = header + length + _LENGTH.size
+    (size,) = _LENGTH.unpack_from(chunk, data - _LENGTH.size)
+    if data + size > len(chunk):
+        raise DamagedError('a record ends beyond its chunk')
+    return _fields(chunk[header : header + length]), data, data + size
+
+
+def _fields(header: bytes) -> dict[str, bytes]:
+    """Names and values of a header."""
+    fields, start = {}, 0
+    while start < len(header):
+        (length,) = _LENGTH.unpack_from(header, start)
+        start += _LENGTH.size
+        name, separator, value = header[start : start + length].partition(b'=')
+        if not separator or start + length > len(header):
+            raise DamagedError('a header is not one of ROS 1')
+        fields[name.decode()] = value
+        start += length
+    return fields
+
+
+def _nanoseconds(time: bytes) -> int:
+    seconds, nanoseconds = _TIME.unpack(time)
+    return seconds * NANOSECONDS + nanoseconds
+
+
+def _normalised(name: str) -> str:
+    """Name of a topic without doubled or closing slashes."""
+    return '/' * name.startswith('/') + '/'.join(part for part in name.split('/') if part)
