@@ -76,6 +76,37 @@ def test_functions_are_short():
     assert long == []
 
 
+# A file in backticks, and perhaps a name that it defines: `config/files.py:read_parameters`.
+NAMED = re.compile(r'`([\w./-]+\.(?:py|md))(?::([\w.]+))?`')
+
+
+def missing_files(text: str) -> list[str]:
+    """Files that a text names and that do not exist, or do not define the name behind them."""
+    missing = []
+    for path, name in NAMED.findall(text):
+        found = [ROOT / path] if (ROOT / path).exists() else []
+        for top in (PACKAGE, 'rs_relpose_lab', 'docs'):
+            # A text on one folder names its files alone.
+            found += (ROOT / top).rglob(path) if '/' not in path else (ROOT / top).glob(path)
+        code = '\n'.join(one.read_text(encoding='utf-8') for one in found)
+        if not found or not all(
+            re.search(rf'(?:def |class |^ *){part}\b', code, re.MULTILINE)
+            for part in name.split('.')
+        ):
+            missing.append(path + name)
+    return missing
+
+
+def test_missing_files_and_names_are_found():
+    text = '`geometry/lens.py:ByLens`, `docs/health.md`, `lens.py`, `no/such.py`, `so3.py:nothing`'
+    assert missing_files(text) == ['no/such.py', 'so3.pynothing']
+
+
+@pytest.mark.parametrize('path', [*PROSE, ROOT / 'CONTRIBUTING.md'], ids=lambda path: path.name)
+def test_documents_name_files_that_exist(path):
+    assert missing_files(path.read_text(encoding='utf-8')) == []
+
+
 @pytest.mark.parametrize(
     'path',
     [*(ROOT / path for path in OF_PACKAGE), *PROSE],

@@ -29,8 +29,8 @@ from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
 
 # Entries of a deviation of the lens (true minus assumed) and their sizes, in the order of all
 # derivatives by the lens: logarithm of both focal lengths; logarithm of fy / fx, which moves fy;
-# radial coefficients k1, k2, k3; principal point cx, cy [px]. [derived: the order of all
-# deviations in core.deviations]
+# radial coefficients k1, k2, k3; principal point cx, cy [px]. [chosen: the order of
+# `core.deviations`]
 LENS_ENTRIES = (('focal_log', 1), ('aspect', 1), ('distortion', 3), ('principal_point', 2))
 # Number of values of a deviation of the lens. [derived: sum of the sizes above]
 N_LENS = 7
@@ -165,18 +165,21 @@ class DistortionModel:
         return Lens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
 
     def moved(self, coefficients: tuple[float, ...], by: Array) -> tuple[float, ...]:
-        """Coefficients with `by` (3,) added to k1, k2, k3: as many as that needs."""
-        if not np.any(by):
+        """Coefficients with `by` (3,) added to k1, k2, k3: as many as that needs.
+
+        A model that has fewer radial coefficients ignores the rest of `by`.
+        """
+        steps = {
+            place: step for place, step in zip(self.radial, by.tolist(), strict=False) if step
+        }
+        if not steps:
             return coefficients
-        places = self.radial[:_N_RADIAL]
-        needed = 1 + max(place for place, step in zip(places, by, strict=True) if step)
-        count = next(n for n in self.coefficient_counts if n >= max(needed, len(coefficients), 1))
-        values = np.zeros(count)
-        values[: len(coefficients)] = coefficients
-        for place, step in zip(places, by, strict=True):
-            if step:
-                values[place] += step
-        return tuple(values.tolist())
+        needed = max(len(coefficients), 1 + max(steps))
+        count = next(legal for legal in self.coefficient_counts if legal >= needed)
+        values = [*coefficients, *[0.0] * (count - len(coefficients))]
+        for place, step in steps.items():
+            values[place] += step
+        return tuple(values)
 
 
 DISTORTION_MODELS = {
