@@ -9,10 +9,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros import estimate_relative_pose, EstimatorConfig, InputError, Status
+from rs_relpose_ros.core import reprojection
 from rs_relpose_ros.estimator import adjustment, frames_between
 from rs_relpose_ros.estimator.arguments import IntermediateFrame
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry.so3 import tangent_basis
 
 CAMERA = RollingShutterCamera(
     width=640,
@@ -267,10 +269,87 @@ def test_derivatives_are_those_of_the_cost(fitted):
         assert abs(half - normal.gradient[k]) < 3e-3 * math.sqrt(normal.hessian[k, k]), k
 
 
+def converged(arguments, state):
+    """The optimum with the noise held, by Gauss-Newton steps."""
+    tracks, priors, _, expected, _ = arguments
+    for _ in range(6):
+        normal = adjustment.linearised(tracks, priors, state, expected)
+        step = np.linalg.solve(normal.hessian, -normal.gradient)
+        state = adjustment.moved_state(state, normal, step)
+    return state
+
+
+def from_state(state, other):
+    """Difference (n,) of the unknowns of two near paths."""
+    return np.concatenate(
+        [
+            tangent_basis(state.t).T @ (other.t - state.t),
+            [other.log_scale - state.log_scale],
+            other.bias - state.bias,
+            (other.accelerations - state.accelerations).ravel(),
+            (other.rotations - state.rotations)[1:].ravel(),
+        ]
+    )
+
+
+def with_changes(tracks, changes, step):
+    """The observations after a step (D,) of the deviations."""
+    V, N = len(tracks.used), tracks.number
+    rows = tracks.observations.copy()
+    flat = np.moveaxis(rows, 2, 3).reshape(V, -1, reprojection.VALUES)
+    own, later = flat[:, :N], (changes.times @ step)[..., None]
+    own[..., reprojection.RAY : reprojection.RAY + 3] += changes.rays @ step
+    moving = own[..., reprojection.MOVING : reprojection.MOVING + 3]
+    own[..., reprojection.MOVED : reprojection.MOVED + 3] += later * moving
+    own[..., reprojection.TIME] += later[..., 0]
+    turned = Rotation.from_rotvec(changes.rotations @ step).as_matrix() @ tracks.rotations
+    blocks = flat.reshape(V, -1, reprojection.BLOCK, reprojection.VALUES)
+    return tracks._replace(
+        observations=np.ascontiguousarray(np.moveaxis(blocks, 3, 2)), rotations=turned
+    )
+
+
+def test_path_by_deviations_equals_finite_differences():
+    """Of rays, row times and the gyro's rotations, the tracks eliminated and fitted again."""
+    calls = []
+    adjust = adjustment.adjust
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            frames_between.adjustment, 'adjust', lambda *a: (calls.append(a), adjust(*a))[1]
+        )
+        Scene(6, sigma=1e-3, gyro=1e-3, count=100).pose()
+    arguments = calls[0]
+    tracks, priors, start, sigma, _ = arguments
+    state, rng = converged(arguments, start), np.random.default_rng(1)
+    V, N, D = len(tracks.used), tracks.number, 3
+    changes = reprojection.Changes(
+        np.zeros((V, N, 3, D)), np.zeros((V, N, D)), np.zeros((V, 3, D))
+    )
+    changes.rays[..., 0] = rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
+    changes.times[..., 1] = rng.normal(size=(V, N))
+    changes.rotations[1:, :, 2] = rng.normal(size=(V - 1, 3))
+    exact = adjustment.path_by_deviations(tracks, priors, state, sigma, changes)
+    sigmas = 1.0 / np.sqrt(np.diag(adjustment.linearised(tracks, priors, state, sigma).hessian))
+    for step in 5e-6 * np.eye(D):
+        up, down = (
+            from_state(
+                state, converged((with_changes(tracks, changes, by), *arguments[1:]), state)
+            )
+            for by in (step, -step)
+        )
+        numeric = (up - down) / 2.0 / sigmas
+        # Gauss-Newton leaves out the curvature of residuals, which are not zero.
+        np.testing.assert_allclose(
+            exact @ step / sigmas, numeric, atol=5e-3 * np.abs(numeric).max()
+        )
+
+
 def independent_residuals(x, tracks, priors, sigma, f0):
     """Residuals of the equations in the docstring of `adjustment`, without its code."""
     V, N = len(tracks.used), tracks.number
-    observations = np.moveaxis(tracks.observations, 2, -1).reshape(V, -1, adjustment.VALUES)[:, :N]
+    observations = np.moveaxis(tracks.observations, 2, -1).reshape(V, -1, reprojection.VALUES)[
+        :, :N
+    ]
     t, log_k, b, e = x[:3] / np.linalg.norm(x[:3]), x[3], x[4:7], x[7:10]
     phi = np.vstack([np.zeros(3), x[10 : 10 + 3 * V - 3].reshape(-1, 3)])
     own = x[10 + 3 * V - 3 :].reshape(N, 3)
@@ -278,7 +357,9 @@ def independent_residuals(x, tracks, priors, sigma, f0):
     f = f0 + own[:, 0:1] * np.array([1.0, 0, 0]) + own[:, 1:2] * np.array([0, 1.0, 0])
     f /= np.linalg.norm(f, axis=1)[:, None]
     for v in range(V):
-        measured, to_pixels, s, moved = np.split(observations[v], [3, 9, 10], axis=1)
+        measured, to_pixels, s, moved = np.split(
+            observations[v, :, : reprojection.MOVING], [3, 9, 10], axis=1
+        )
         p = s / T * t + np.exp(log_k) * (moved + 0.5 * e * (s * s - T * s))
         R = np.einsum(
             'nij,jk->nik', Rotation.from_rotvec(phi[v] + s * b).as_matrix(), tracks.rotations[v]
@@ -293,7 +374,7 @@ def independent_residuals(x, tracks, priors, sigma, f0):
         [
             *out,
             information @ phi[1:].ravel(),
-            own[:, 2] / adjustment._INVERSE_DISTANCE_SIGMA,
+            own[:, 2] / adjustment.INVERSE_DISTANCE_SIGMA,
             [
                 math.sqrt(priors.log_scale_weight) * (log_k - priors.log_scale),
                 10.0 * (np.linalg.norm(x[:3]) - 1.0),
@@ -317,8 +398,11 @@ def test_optimum_is_that_of_an_independent_fit():
     adjusted = adjust(tracks, priors, start, expected, weight)
     for _ in range(6):  # far beyond the steps of an estimate
         adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)
-    sigma = math.hypot(adjusted.sigma, adjustment._COMMON_SIGMA)
-    directions, rho = start.tracks[0, :3, :25].T, start.tracks[0, adjustment.INVERSE_DISTANCE, :25]
+    sigma = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
+    directions, rho = (
+        start.tracks[0, :3, :25].T,
+        start.tracks[0, reprojection.INVERSE_DISTANCE, :25],
+    )
     begin = np.concatenate(
         [
             start.t,

@@ -12,16 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import MOTIONS
-from rs_relpose_ros.estimator import adjustment
-from rs_relpose_ros.estimator.adjustment import (
-    Adjusted,
+from rs_relpose_ros.core.reprojection import (
+    ACCELERATION,
     BIAS,
+    empty_blocks,
+    fill_view,
+    FrameInertia,
+    FrameRays,
+    INVERSE_DISTANCE,
     LOG_SCALE,
-    PathPriors,
-    PathState,
+    MOST_ACCELERATIONS,
+    start_of_tracks,
     TANGENT,
+    TIME,
+    TO_PIXELS,
     TrackBlocks,
 )
+from rs_relpose_ros.estimator import adjustment
+from rs_relpose_ros.estimator.adjustment import Adjusted, PathPriors, PathState
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
@@ -89,10 +97,8 @@ def refined(pose: RelativePose, problem: PairProblem) -> RelativePose:
         )
         state = adjusted.state
         tracks.used[adjusted.far] = False
-        tracks.observations.swapaxes(2, 3)[
-            adjusted.far, adjustment.TO_PIXELS : adjustment.TIME
-        ] = 0.0
-    distances = state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]  # a copy
+        tracks.observations.swapaxes(2, 3)[adjusted.far, TO_PIXELS:TIME] = 0.0
+    distances = state.tracks[:, INVERSE_DISTANCE][tracks.used[0]]  # a copy
     if not (np.isfinite(adjusted.covariance).all() and median(distances) > 0.0):
         return pose.diagnosed(frames_reason='the adjustment of all frames does not converge')
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, sigma):
@@ -197,27 +203,21 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
     )
     used = _usable(rays, points[..., 1], camera.height)
     rows = np.where(used, points[..., 1], camera.reference_row_index)
-    blocks = views, -(-count // adjustment.BLOCK)
-    tracks = TrackBlocks(
-        np.zeros((*blocks, adjustment.VALUES, adjustment.BLOCK)),
-        np.zeros((*blocks, adjustment.BLOCK), dtype=bool),
-        path.rotations,
-        float(path.seconds[-1]),
-        count,
-    )
+    tracks = empty_blocks(path.rotations, float(path.seconds[-1]), count)
     times = camera.row_times(rows)
     alphas, betas, accelerations = _moved_by_imu(path)
     arm, chord, _ = _camera_by_imu(path)
     for view, motion in enumerate(path.motions):
-        adjustment.fill_view(
-            tracks,
-            view,
+        frame = FrameRays(
             used[view],
             rays[view],
             jacobian[view],
             times[view],
             motion.rotations(times[view]),
             camera.line_delay * motion.angular_velocity,
+            motion.angular_velocity,
+        )
+        inertia = FrameInertia(
             float(path.seconds[view]),
             alphas[view],
             betas[view],
@@ -225,6 +225,7 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
             arm,
             chord,
         )
+        fill_view(tracks, view, frame, inertia)
     return tracks
 
 
@@ -287,7 +288,7 @@ def _gyro_errors(path: PairProblem) -> tuple[float, Array]:
 def _of_carrier(sigma: float, interval: float) -> Array:
     """Variances (K,) of the Legendre coefficients of an exponentially correlated acceleration."""
     x, weights = np.polynomial.legendre.leggauss(16)
-    count = adjustment.MOST_ACCELERATIONS
+    count = MOST_ACCELERATIONS
     polynomials = np.polynomial.legendre.legvander(x, count - 1).T
     norms = np.arange(count)[:, None] + 0.5
     to_coefficients = norms * weights * polynomials
@@ -311,7 +312,7 @@ def _start(
         0.5 * off / T,
         np.zeros((len(priors.acceleration_weights), 3)),
         rotations,
-        adjustment.start_of_tracks(tracks, np.ascontiguousarray(pose.R), pose.t),
+        start_of_tracks(tracks, np.ascontiguousarray(pose.R), pose.t),
     )
 
 
@@ -380,6 +381,6 @@ def _velocities(state: PathState, path: PairProblem, n: int) -> tuple[Array, Arr
     derivatives = np.zeros((2, 3, n))
     derivatives[..., TANGENT:LOG_SCALE] = tangent_basis(state.t) / T
     derivatives[..., LOG_SCALE] = of_scale
-    of_accelerations = derivatives[..., adjustment.ACCELERATION :]
+    of_accelerations = derivatives[..., ACCELERATION:]
     of_accelerations[..., : bends.shape[1] * 3] = k * by_axes(bends).reshape(2, 3, -1)
     return state.t / T + of_scale, derivatives

@@ -44,6 +44,18 @@ def scale(factor: float, v: Vector | Array) -> Vector:
 
 
 @small_kernel
+def column(rows: Array, first: int, i: int) -> Vector:
+    """Vector in column i of `rows` (n, m), from row `first` on."""
+    return (rows[first, i], rows[first + 1, i], rows[first + 2, i])
+
+
+@small_kernel
+def write_column(v: Vector, rows: Array, first: int, i: int) -> None:
+    """Write a vector into column i of `rows` (n, m), from row `first` on."""
+    rows[first, i], rows[first + 1, i], rows[first + 2, i] = v
+
+
+@small_kernel
 def norm(v: Vector | Array) -> float:
     """``|v|`` of a vector whose squares neither overflow nor vanish."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
