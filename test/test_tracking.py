@@ -106,10 +106,10 @@ def window_at(image, centres, radius):
 @pytest.mark.parametrize(('levels', 'off'), [(1, 1.5), (2, 5.0)])
 def test_patches_and_whole_images_agree(images, points, levels, off, monkeypatch):
     guess = points + SHIFT + off * np.random.default_rng(1).uniform(-1.0, 1.0, points.shape)
-    whole = klt.whole_images(*images, points, guess, 15, levels, CRITERIA)
+    whole = klt.whole_images(*images, points, guess, klt.Search(15, levels, CRITERIA))
     called = []
     monkeypatch.setattr(windows, 'cut', lambda *a: called.append(1) or cut(*a))
-    on_patches = follow(*images, points, guess, 15, levels, CRITERIA)
+    on_patches = follow(*images, points, guess, klt.Search(15, levels, CRITERIA))
     assert len(called) == 2 * levels
     right = np.linalg.norm(whole.points - points - SHIFT, axis=1) < 0.3
     assert np.mean(right) > 0.85
@@ -123,17 +123,24 @@ def test_many_points_are_followed_in_the_image_itself(images, monkeypatch):
     """Patches of all of them would be larger than the image."""
     monkeypatch.setattr(windows, 'cut', None)
     points = np.random.default_rng(2).uniform([30.0, 30.0], [609.0, 449.0], (400, 2))
-    flow = follow(*images, points, points + SHIFT, 15, 1, CRITERIA)
+    flow = follow(*images, points, points + SHIFT, klt.Search(15, 1, CRITERIA))
     assert np.mean(np.linalg.norm(flow.points - points - SHIFT, axis=1) < 0.3) > 0.95
 
 
 def test_what_lies_beyond_a_patch_or_the_image_is_lost(images, points):
-    far = follow(*images, points, points + SHIFT + 9.0, 15, 1, CRITERIA)
+    far = follow(*images, points, points + SHIFT + 9.0, klt.Search(15, 1, CRITERIA))
     assert (np.linalg.norm(far.points - points - SHIFT - 9.0, axis=1)[far.found] < 6.0).all()
     assert np.mean(far.found) < 0.9
     outside = np.array([[-40.0, 100.0], [1e9, 1e9], [630.0, 5000.0]])
-    assert not follow(*images, np.full((3, 2), 200.0), outside, 15, 2, CRITERIA).found.any()
-    assert len(follow(*images, np.empty((0, 2)), np.empty((0, 2)), 15, 1, CRITERIA).points) == 0
+    assert not follow(
+        *images, np.full((3, 2), 200.0), outside, klt.Search(15, 2, CRITERIA)
+    ).found.any()
+    assert (
+        len(
+            follow(*images, np.empty((0, 2)), np.empty((0, 2)), klt.Search(15, 1, CRITERIA)).points
+        )
+        == 0
+    )
 
 
 def test_warped_patches_are_those_of_the_warped_image(images, points):

@@ -15,15 +15,22 @@ from scipy.spatial import KDTree
 from rs_relpose_ros.config.settings import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.matches import Matches
+from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import checked, Image
 
-# Side of the window over which the structure tensor of the half-size image is summed.
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+# Side of the window [px] over which the structure tensor of the half-size image is summed. A
+# smaller one finds single pixels of noise, a larger one blurs corners that lie together.
+# [chosen: 5 px there are 10 px of the image, less than a window of Lucas-Kanade]
 _BLOCK = 5
-# Images with a side shorter than this are searched at full size.
+# Images with a side shorter than this [px] are searched at full size: of half of them little would
+# be left beside the margins. [chosen: cameras of 320x240 are halved]
 _SHORTEST_HALVED = 240
 # OpenCV's threshold, relative to the best corner, must be positive; the one used is absolute.
+# [chosen: any value below the quality of the faintest corner by the brightest one]
 _ALL = 1e-9
 
 
@@ -47,29 +54,19 @@ def find_corners(
     if count <= 0 or min(image.shape) <= 2 * margin + _BLOCK:
         return np.empty((0, 2))
     first, last = feature_rows(config, height)
+    top = max(margin, math.ceil(first / scale))
+    bottom = math.floor(last / scale) + 1
     distance = config.min_feature_distance / scale
     free = np.zeros(image.shape, dtype=np.uint8)
-    free[max(margin, math.ceil(first / scale)) : math.floor(last / scale) + 1, margin:-margin] = (
-        255
-    )
+    free[top:bottom, margin:-margin] = 255
     free[-margin:] = 0
     _occupy(free, taken / scale, math.ceil(distance))
-    points = scale * _strong_corners(
-        image,
-        free,
-        distance,
-        config.feature_quality,
-    )
+    points = scale * _strong_corners(image, free, distance, config.feature_quality)
     cell = math.sqrt(height * width / config.max_features)
     return points[_spread(points, taken, cell)[:count]]
 
 
-def _strong_corners(
-    image: Image,
-    free: Image,
-    distance: float,
-    least: float,
-) -> Array:
+def _strong_corners(image: Image, free: Image, distance: float, least: float) -> Array:
     """Corners (N, 2) at nonzero pixels of `free` (H, W), best first, at a mutual distance.
 
     `least`: smallest eigenvalue of the structure tensor [gray^2/px^2].
@@ -91,8 +88,10 @@ def _occupy(free: Image, points: Array, radius: int) -> None:
     for k in range(points.shape[0]):
         x = round(points[k, 0])
         y = round(points[k, 1])
-        for row in range(max(y - radius, 0), min(y + radius + 1, height)):
-            for column in range(max(x - radius, 0), min(x + radius + 1, width)):
+        top = max(y - radius, 0)
+        left = max(x - radius, 0)
+        for row in range(top, min(y + radius + 1, height)):
+            for column in range(left, min(x + radius + 1, width)):
                 if (column - x) ** 2 + (row - y) ** 2 <= radius * radius:
                     free[row, column] = 0
 
@@ -103,7 +102,7 @@ def feature_rows(config: TrackingConfig, height: int) -> tuple[float, float]:
     return (first, last) if last > 0.0 else (first, height - 1.0)
 
 
-def keep_apart(points: Array, radius: float) -> NDArray[np.bool_]:
+def keep_apart(points: Array, radius: float) -> Flags:
     """Mask (N,) of points (N, 2) that are not within `radius` of one before them."""
     kept = np.ones(len(points), dtype=bool)
     if len(points) > 1:
@@ -113,7 +112,7 @@ def keep_apart(points: Array, radius: float) -> NDArray[np.bool_]:
     return kept
 
 
-def _spread(points: Array, taken: Array, cell: float) -> NDArray[np.intp]:
+def _spread(points: Array, taken: Array, cell: float) -> Indices:
     """Order of `points` (N, 2), best first, that fills the cells of a grid evenly.
 
     A point ranks behind the better ones of its cell and behind those `taken` (M, 2) in it.
@@ -123,8 +122,9 @@ def _spread(points: Array, taken: Array, cell: float) -> NDArray[np.intp]:
     cells = row * (column.max(initial=0) + 1) + column
     by_cell = np.argsort(cells, kind='stable')
     _, starts, sizes = np.unique(cells[by_cell], return_index=True, return_counts=True)
+    place = np.arange(len(both)) - np.repeat(starts, sizes)  # within the cell
     rank = np.empty(len(both), dtype=np.int64)
-    rank[by_cell] = np.arange(len(both)) - np.repeat(starts, sizes)
+    rank[by_cell] = place
     return np.argsort(rank[len(taken) :], kind='stable')
 
 
@@ -134,26 +134,27 @@ class TrackIds:
     def __init__(self) -> None:
         self._next = 0
 
-    def take(self, count: int) -> NDArray[np.uint32]:
+    def take(self, count: int) -> Ids:
         """New ids (count,); from 2^32 on they start again."""
-        ids = (np.arange(self._next, self._next + count) % 2**32).astype(np.uint32)
+        first = self._next
         self._next += count
-        return ids
+        return (np.arange(first, self._next) % 2**32).astype(np.uint32)
 
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
-# ORB's patch and its border [px].
+# Smallest side of an image [px] with descriptors: in a smaller one none has a place.
+# [derived: ORB's patch of 31 px]
 _SMALLEST_SIDE = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Keypoints:
-    """Keypoints of an image: ids (N,), pixels (N, 2), descriptors (N, D)."""
+    """Keypoints of an image."""
 
-    ids: NDArray[np.uint32]
-    points: Array
-    descriptors: Descriptors
+    ids: Ids  # (N,)
+    points: Array  # (N, 2) pixels
+    descriptors: Descriptors  # (N, D)
 
 
 class DescriptorTracker:
@@ -209,17 +210,15 @@ class DescriptorTracker:
         """Match `image`, the new current one, with the reference."""
         if self._reference is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
-        image = checked(image, self._shape)
-        found = self._detect(image)
-        indices1, indices2, quality = self._match(self._reference, found)
+        reference = self._reference
+        found = self._detect(checked(image, self._shape))
+        indices1, indices2, quality = self._match(reference, found)
+        ids = reference.ids[indices1]
         # A matched keypoint takes the id of the reference.
-        found.ids[indices2] = self._reference.ids[indices1]
+        found.ids[indices2] = ids
+        points = np.stack([reference.points[indices1], found.points[indices2]])
         self._current = found
-        self._matches = Matches(
-            self._reference.ids[indices1],
-            np.stack([self._reference.points[indices1], found.points[indices2]]),
-            quality,
-        )
+        self._matches = Matches(ids, points, quality)
         self._most = max(self._most, len(self._matches))
         return self._matches
 
@@ -254,22 +253,15 @@ class DescriptorTracker:
             self._ids.take(len(kept)), points[kept], np.ascontiguousarray(descriptors[kept])
         )
 
-    def _match(
-        self, first: _Keypoints, second: _Keypoints
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    def _match(self, first: _Keypoints, second: _Keypoints) -> tuple[Indices, Indices, Array]:
         """Indices into both and quality: 1 - (best / second best distance)."""
         if len(first.ids) < 2 or len(second.ids) < 2:
-            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+            nothing = np.empty(0, dtype=np.int64)
+            return nothing, nothing, np.empty(0)
         distances, nearest = self._nearest(first.descriptors, second.descriptors, 2)
-        best = distances[:, 0]
-        other = distances[:, 1]
+        best, other = distances.T
         # Two equally good neighbours, even perfect ones, are no match.
-        ratio = np.divide(
-            best,
-            other,
-            out=np.ones_like(best),
-            where=other > 0.0,
-        )
+        ratio = np.divide(best, other, out=np.ones_like(best), where=other > 0.0)
         matched = np.flatnonzero(ratio < self._config.match_ratio)
         partners = nearest[matched, 0]
         if len(matched):
@@ -281,7 +273,7 @@ class DescriptorTracker:
 
     def _nearest(
         self, first: Descriptors, second: Descriptors, count: int
-    ) -> tuple[Array, NDArray[np.int64]]:
+    ) -> tuple[Array, Indices]:
         """Distances (N, count) and indices (N, count) of the nearest in `second`."""
         distances, indices = cv2.batchDistance(
             first, second, self._depth, normType=self._norm, K=count

@@ -15,20 +15,29 @@ from rs_relpose_ros.errors import InputError
 
 # -- Brightness -----------------------------------------------------------------------------------
 
-# Percentiles of an image that become black and white, of every third pixel in both directions: an
-# odd stride samples all colours of a Bayer pattern.
+Bytes = NDArray[np.uint8]
+Image = NDArray[np.uint8]  # (H, W) gray
+
+# Percentiles of an image that become black and white. With the extremes, one dead pixel would
+# determine the range. [chosen: any value up to 2 % cuts off only lamps and dead pixels]
 _ENDS = (0.5, 99.5)
+# Every third pixel in both directions is counted: an odd stride samples all colours of a Bayer
+# pattern, and a ninth of the pixels is enough for a percentile. [derived: 2 is even]
 _STRIDE = 3
-# The range exceeds that of an image by this share on either side, so that the next ones fit. It is
-# chosen again for an image that leaves it or fills less than _LEAST_FILLED of it: a new range
-# changes the brightness of the tracked windows.
+# The range exceeds that of an image by this share on either side, so that the next ones fit: a new
+# range changes the brightness of the tracked windows. More wastes gray levels.
+# [chosen: a third of the gray levels are spare at the begin]
 _MARGIN = 0.25
+# The range is chosen again for an image that fills less than this share of it.
+# [chosen: then a quarter of the gray levels are in use; any value in 0.2..0.5 would do]
 _LEAST_FILLED = 0.3
-# Smallest range, the number of gray levels: noise of a dark image is not stretched.
+# Smallest range: noise of a dark image is not stretched. [derived: the number of gray levels]
 _LEAST_RANGE = 255.0
 
-# An image is dark if this percentage of its pixels is below this gray level.
+# An image is dark if this percentage of its pixels is below the gray level: a lamp in the image
+# does not help the tracker. [chosen: 1 % of an image has room for a few corners only]
 _DARK_SHARE = 99.0
+# [chosen: an eighth of the range; corners of noise-free texture need some 10 gray levels]
 _DARK_GRAY = 32
 
 
@@ -41,7 +50,7 @@ class GrayLevels:
     def __init__(self) -> None:
         self._low = self._high = 0.0
 
-    def gray(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    def gray(self, pixels: NDArray[np.uint16]) -> Image:
         """Gray image (H, W) of the next image."""
         low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
         if (
@@ -53,14 +62,11 @@ class GrayLevels:
             self._low = max(low - spare, 0.0)
             self._high = max(high + spare, self._low + _LEAST_RANGE)
         scale = 255.0 / (self._high - self._low)
-        return np.asarray(
-            np.clip((pixels - np.float32(self._low)) * np.float32(scale), 0.0, 255.0).astype(
-                np.uint8
-            )
-        )
+        levels = (pixels - np.float32(self._low)) * np.float32(scale)
+        return np.asarray(np.clip(levels, 0.0, 255.0).astype(np.uint8))
 
 
-def is_dark(image: NDArray[np.uint8]) -> bool:
+def is_dark(image: Image) -> bool:
     """Whether almost no pixel of a gray image (H, W) is bright: night, a covered lens."""
     return bool(np.percentile(image[::_STRIDE, ::_STRIDE], _DARK_SHARE) < _DARK_GRAY)
 
@@ -73,16 +79,19 @@ _JPEG_SIGNATURE = b'\xff\xd8\xff'
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers without a length field: TEM and RST0 to RST7.
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
-# Most bytes after the end marker of a JPEG: cameras pad their files.
+# Bytes at the end of a file in which its end marker is searched: cameras pad their files, up to a
+# page of memory. [derived: pages have 4096 bytes]
 _PADDING = 4096
+# Bytes of a PNG up to the size of its image. [derived: signature, length, name, width, height]
+_PNG_HEADER = 24
 
 
-def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+def encoded_image_size(data: Bytes) -> tuple[int, int]:
     """Width and height [px] in the header of a JPEG or PNG."""
-    start = data[:24].tobytes()
+    start = data[:_PNG_HEADER].tobytes()
     end = data[-_PADDING:].tobytes()
     if start.startswith(_PNG_SIGNATURE):
-        if len(start) < 24 or start[12:16] != b'IHDR' or b'IEND' not in end:
+        if len(start) < _PNG_HEADER or start[12:16] != b'IHDR' or b'IEND' not in end:
             raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')
         return int.from_bytes(start[16:20], 'big'), int.from_bytes(start[20:24], 'big')
     if not start.startswith(_JPEG_SIGNATURE):
@@ -93,7 +102,12 @@ def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
     return _jpeg_size(data)
 
 
-def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+def _jpeg_size(data: Bytes) -> tuple[int, int]:
+    """Width and height [px] in the frame header of a JPEG."""
+
+    def number(at: int) -> int:
+        return int(data[at]) << 8 | int(data[at + 1])
+
     at = 2
     while at + 9 <= len(data):
         if data[at] != 0xFF:
@@ -104,11 +118,9 @@ def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
         elif marker in _STANDALONE:
             at += 2
         elif marker in _START_OF_FRAME:
-            height = int(data[at + 5]) << 8 | int(data[at + 6])
-            width = int(data[at + 7]) << 8 | int(data[at + 8])
-            return width, height
+            return number(at + 7), number(at + 5)
         else:
-            length = int(data[at + 2]) << 8 | int(data[at + 3])
+            length = number(at + 2)
             if length < 2:
                 break
             at += 2 + length
@@ -117,11 +129,11 @@ def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
 
 # -- Encodings ------------------------------------------------------------------------------------
 
-Bytes = NDArray[np.uint8]
-Image = NDArray[np.uint8]  # (H, W) gray
-
-# Largest side [px] and area [px^2] of an image: far above any camera, far below the memory.
+# Largest side of an image [px]: far above any camera. A header may claim any size.
+# [chosen: the largest sensors have 12 000 px]
 MAX_IMAGE_SIDE = 16384
+# Largest area of an image [px]: far below the memory of a computer.
+# [chosen: 64 Mpx of colour take 200 MB]
 MAX_IMAGE_PIXELS = 64 * 1024 * 1024
 
 # Encoding -> (channels, conversion of OpenCV). '8UC3' has no order; it is read as by cv_bridge.
@@ -254,7 +266,7 @@ class RawImage:
         order = '>u2' if self.is_bigendian else '<u2'
         return self._rows(2).view(order)
 
-    def _colors(self) -> NDArray[np.uint8]:
+    def _colors(self) -> Bytes:
         channels = _COLOR[self.encoding][0]
         return self._rows(channels).reshape(self.height, self.width, channels)
 
@@ -342,11 +354,8 @@ EncodedImage = RawImage | CompressedImage
 
 def check_image_size(width: int, height: int) -> None:
     """Raise InputError for an impossible size."""
-    if not (
-        0 < width <= MAX_IMAGE_SIDE
-        and 0 < height <= MAX_IMAGE_SIDE
-        and width * height <= MAX_IMAGE_PIXELS
-    ):
+    sides = 0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
+    if not sides or width * height > MAX_IMAGE_PIXELS:
         raise InputError(
             f'image size {width}x{height} is not usable: sides must be 1 to '
             f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px'

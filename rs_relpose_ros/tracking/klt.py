@@ -15,37 +15,64 @@ from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.tracking import features, windows
 from rs_relpose_ros.tracking.images import checked, Image
 
-# OpenCV's termination criteria: kind, steps, step [px].
-Criteria = tuple[int, int, float]
+Flags = NDArray[np.bool_]
 
-# OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
+# Factor from OpenCV's eigenvalues to the smallest eigenvalue of the structure tensor of the gray
+# levels. [derived: OpenCV divides by 2^20, and a Scharr gradient is 32 times the derivative]
 _SCHARR = 2.0**20 / 32.0**2
-# Search radius [px] of a window without a pyramid; one level more doubles it.
+# Search radius [px] of a window without a pyramid; one level more doubles it. With less, fast
+# points are lost at the first level; the cost of a patch grows with its square.
+# [chosen: 3..6; predictions are off by less than 2 px]
 _REACH = 4
-# Pixels around a window for derivatives, interpolation and rounding.
+# Pixels around a window for derivatives (1), interpolation (1) and rounding (1). [derived]
 _FRINGE = 3
-# Patches are cut out of images that are larger by this factor.
+# Patches are cut out of images that are larger than all patches together by this factor: below
+# it, preparing the whole image costs as much. [chosen: cutting costs about a copy]
 _WORTH = 2.0
-# Termination criteria of OpenCV for tracking and for alignment.
-_TRACKING_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
-_ALIGNMENT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
-# Errors of a guess [px] that are corrected without a pyramid.
+# OpenCV's criteria to end the search of a window: number of steps and size of a step [px]. The
+# alignment has the accuracy of a match, tracking only has to stay on the point.
+# [chosen: a step of 0.02 px is a tenth of the noise of a match, one of 0.005 px a fortieth]
+_ENDS = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+_TRACKING_CRITERIA = (_ENDS, 15, 0.02)
+_ALIGNMENT_CRITERIA = (_ENDS, 20, 0.005)
+# Errors of a guess [px] that are corrected without a pyramid. A larger value lets windows find
+# neighbours of the same look, a smaller one costs a pyramid more often. [derived: half of _REACH]
 _NEAR = 2.0
-# Levels of the pyramid for a predicted motion, and if the guesses of the last frame were off by at
-# most half of _NEAR, except for a share.
+# Levels of the pyramid for a predicted motion.
+# [derived: one level more than none corrects the parallax of a frame at 30 Hz]
 _EXPECTED_LEVELS = 2
+# Levels of the pyramid after guesses that were off by at most half of _NEAR. [derived: no pyramid]
 _NEAR_LEVELS = 1
+# Share of guesses that may be further off than that: their tracks are found again by a second
+# search, while one pyramid for all costs more. [chosen: few tracks of some hundred]
 _MOST_FAR = 0.05
-# Share of lost tracks above which the search is repeated with all levels.
+# Share of lost tracks above which the search is repeated with all levels. With less, each frame
+# with moving objects is searched twice; with more, a sudden motion loses its tracks.
+# [chosen: far above the losses of a steady motion, far below _HOPELESS]
 _MOST_LOST = 0.15
 # Share of lost tracks above which the prediction is not used: a gyro in a wrong unit or axes.
+# [chosen: a right prediction loses less than _MOST_LOST, a wrong one nearly all]
 _HOPELESS = 0.5
-# Largest correction [px] of an alignment: drift is smaller.
+# Largest correction [px] of an alignment. A larger one is another point: a track drifts by less
+# over the frames of a pair. [chosen: errors of a step are a fraction of a pixel]
 _LARGEST_CORRECTION = 3.0
 # Points of a window homography: more of them cost time and gain nothing.
+# [derived: eight unknowns from 200 coordinates]
 _FITTED = 100
-# Largest change of area of a window homography that is not degenerate.
+# Fewest points of a window homography: with less, its eight unknowns follow the noise.
+# [derived: twice the four points that determine it]
+_LEAST_FITTED = 8
+# Largest change of area of a window homography that is not degenerate: windows that shrink by more
+# have no texture left. [chosen: twice as near, any value in 2..10 would do]
 _LARGEST_STRETCH = 4.0
+
+
+class Search(NamedTuple):
+    """How windows are searched."""
+
+    side: int  # [px] of a window
+    levels: int  # of the pyramid, 1 for the original images only
+    criteria: tuple[int, int, float]  # of OpenCV: kind, steps, step [px]
 
 
 class Flow(NamedTuple):
@@ -53,80 +80,42 @@ class Flow(NamedTuple):
 
     points: Array  # (N, 2) in the second image
     found: NDArray[np.bool_]  # (N,)
-    strength: Array  # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
+    strength: Array  # (N,) [gray^2/px^2] smallest eigenvalue of each window's structure tensor
 
 
-def follow(
-    image1: Image,
-    image2: Image,
-    points1: Array,
-    guess: Array,
-    side: int,
-    levels: int,
-    criteria: Criteria,
-) -> Flow:
-    """Points of `image2` near the `guess` (N, 2) that match `points1` (N, 2) of `image1`.
-
-    `side` [px] of the windows; `levels` of the pyramid, 1 for the original images only.
-    """
+def follow(image1: Image, image2: Image, points1: Array, guess: Array, search: Search) -> Flow:
+    """Points of `image2` near the `guess` (N, 2) that match `points1` (N, 2) of `image1`."""
     if not len(points1):
         return Flow(points1, np.empty(0, dtype=bool), np.empty(0))
-    radius = patch_radius(side, _REACH)
-    if levels <= 2 and image1.size > _WORTH * len(points1) * (2 * radius + 1) ** 2:
-        if levels == 2:
+    patch = 2 * patch_radius(search.side, _REACH) + 1
+    if search.levels <= 2 and image1.size > _WORTH * len(points1) * patch**2:
+        if search.levels == 2:
             # As in a pyramid: the coarse level gives the start of the fine one.
-            coarse = _near(
-                cv2.pyrDown(image1),  # type: ignore[arg-type]
-                cv2.pyrDown(image2),  # type: ignore[arg-type]
-                0.5 * points1,
-                0.5 * guess,
-                side,
-                radius,
-                criteria,
-            )
+            half1: Image = cv2.pyrDown(image1)  # type: ignore[assignment]
+            half2: Image = cv2.pyrDown(image2)  # type: ignore[assignment]
+            coarse = _near(half1, half2, 0.5 * points1, 0.5 * guess, search)
             guess = np.where(coarse.found[:, None], 2.0 * coarse.points, guess)
-        flow = _near(
-            image1,
-            image2,
-            points1,
-            guess,
-            side,
-            radius,
-            criteria,
-        )
+        flow = _near(image1, image2, points1, guess, search)
     else:
-        flow = whole_images(
-            image1,
-            image2,
-            points1,
-            guess,
-            side,
-            levels,
-            criteria,
-        )
-    return Flow(flow.points, flow.found & inside(image2, flow.points), flow.strength)
+        flow = whole_images(image1, image2, points1, guess, search)
+    return flow._replace(found=flow.found & inside(image2, flow.points))
 
 
-def inside(image: Image, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+def inside(image: Image, points: Array, margin: float = 0.0) -> Flags:
     """Which of the points (N, 2) lie `margin` pixels within an image's outermost pixel centres."""
     height, width = image.shape
-    within = (points >= margin) & (points <= (width - 1.0 - margin, height - 1.0 - margin))
+    last = width - 1.0 - margin, height - 1.0 - margin
+    within = (points >= margin) & (points <= last)
     return within[:, 0] & within[:, 1]
 
 
 def patch_radius(side: int, reach: int) -> int:
-    """Of patches in which windows of `side` can be followed over `reach` pixels."""
+    """Radius of patches in which windows of `side` can be followed over `reach` pixels."""
     return side // 2 + reach + _FRINGE
 
 
 def whole_images(
-    image1: Image,
-    image2: Image,
-    points1: Array,
-    guess: Array,
-    side: int,
-    levels: int,
-    criteria: Criteria,
+    image1: Image, image2: Image, points1: Array, guess: Array, search: Search
 ) -> Flow:
     """`follow` by OpenCV on whole images, over any distance."""
     points2, status, eigenvalues = cv2.calcOpticalFlowPyrLK(
@@ -134,9 +123,9 @@ def whole_images(
         image2,
         points1.astype(np.float32, order='C'),
         guess.astype(np.float32, order='C'),
-        winSize=(side, side),
-        maxLevel=levels - 1,
-        criteria=criteria,
+        winSize=(search.side, search.side),
+        maxLevel=search.levels - 1,
+        criteria=search.criteria,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
     )
     return Flow(
@@ -146,81 +135,52 @@ def whole_images(
     )
 
 
-def _near(
-    image1: Image,
-    image2: Image,
-    points1: Array,
-    guess: Array,
-    side: int,
-    radius: int,
-    criteria: Criteria,
-) -> Flow:
+def _near(image1: Image, image2: Image, points1: Array, guess: Array, search: Search) -> Flow:
     """`follow` on patches, which end `_REACH` pixels from the guess."""
+    radius = patch_radius(search.side, _REACH)
     first = windows.cut(image1, points1, radius)
     second = windows.cut(image2, guess, radius)
     flow = whole_images(
-        first.image, second.image, points1 + first.shifts, guess + second.shifts, side, 1, criteria
+        first.image,
+        second.image,
+        points1 + first.shifts,
+        guess + second.shifts,
+        search._replace(levels=1),
     )
     points2 = flow.points - second.shifts
     near = (np.abs(points2 - guess) <= _REACH).all(axis=1)
-    return Flow(points2, flow.found & near, flow.strength)
+    return flow._replace(points=points2, found=flow.found & near)
 
 
-# -- Alignment removes the drift of a track: the error of one alignment is left. The current image
-# -- is resampled to the geometry of the reference, by a homography fitted to the tracks.
+# -- Alignment removes the drift of a track: the error of one alignment is left -------------------
+#
+# The current image is resampled to the geometry of the reference, by a homography fitted to the
+# tracks.
 
 
 def aligned(
     matches: Matches, reference: Image, current: Image, config: TrackingConfig
-) -> tuple[Matches, NDArray[np.bool_]]:
+) -> tuple[Matches, Flags]:
     """`matches` (N) with their second points aligned, and a mask (N,) of those that correlate."""
     points1 = matches.points1
     points2 = matches.points2
-    side = config.klt_window
-    radius = patch_radius(side, math.ceil(_LARGEST_CORRECTION))
+    search = Search(config.klt_window, 1, _ALIGNMENT_CRITERIA)
+    radius = patch_radius(search.side, math.ceil(_LARGEST_CORRECTION))
     jacobians = window_jacobians(points1, points2)
-    there = windows.cut_warped(
-        current,
-        points2,
-        jacobians,
-        radius,
-        points1,
-    )
+    there = windows.cut_warped(current, points2, jacobians, radius, points1)
     here = windows.cut(reference, points1, radius)
-    image = windows.with_brightness(
-        there.image,
-        windows.brightness_table(
-            reference,
-            current,
-            points1,
-            points2,
-            side,
-        ),
-    )
+    table = windows.brightness_table(reference, current, points1, points2, search.side)
+    image = windows.with_brightness(there.image, table)
     start = points1 + here.shifts
-    flow = whole_images(
-        here.image,
-        image,
-        start,
-        start,
-        side,
-        1,
-        _ALIGNMENT_CRITERIA,
-    )
+    flow = whole_images(here.image, image, start, start, search)
     # From the pixels of the reference to those of the current image: p2 + J (x - p1).
     correction = np.einsum('nij,nj->ni', jacobians, flow.points - start)
     found = points2 + correction
-    correlation = windows.correlations(
-        here.image,
-        image,
-        start,
-        flow.points,
-        side,
-    )
+    correlation = windows.correlations(here.image, image, start, flow.points, search.side)
     # Patches repeat the border of the image: a match there is not in the image.
     good = (
         flow.found
-        & inside(current, found, side // 4)
+        & inside(current, found, search.side // 4)
         & (correlation >= config.min_correlation)
         & (np.linalg.norm(correction, axis=1) <= _LARGEST_CORRECTION)
     )
@@ -234,11 +194,12 @@ def window_homography(points1: Array, points2: Array) -> Array:
 
     The identity if there are too few points or the fit is degenerate.
     """
-    if len(points1) < 8:
+    if len(points1) < _LEAST_FITTED:
         return np.eye(3)
-    # Without a solution OpenCV returns None: an array without shape.
     some = slice(None, None, -(-len(points1) // _FITTED))
-    H = np.asarray(cv2.findHomography(points1[some], points2[some], method=0)[0], dtype=np.float64)
+    fitted, _ = cv2.findHomography(points1[some], points2[some], method=0)
+    # Without a solution OpenCV returns None: an array without shape.
+    H = np.asarray(fitted, dtype=np.float64)
     if H.shape != (3, 3) or not np.isfinite(H).all():
         return np.eye(3)
     scale = points1 @ H[2, :2] + H[2, 2]
@@ -266,7 +227,7 @@ class KltTracker:
     """Lucas-Kanade tracking of Shi-Tomasi corners; see `rs_relpose_ros.tracking.features.Tracker`.
 
     From frame to frame windows hardly change, so that tracks are long, but errors add up. For a
-    keyframe pair `refined_matches` aligns each window with that of the reference keyframe.
+    keyframe pair `refined_matches` aligns each window with the window of the reference keyframe.
     """
 
     def __init__(self, config: TrackingConfig) -> None:
@@ -314,26 +275,13 @@ class KltTracker:
         expected = predicted is not None or bool(self._unexplained.any())
         predicted = points if predicted is None else _usable(predicted, points, image.shape)
         guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
-        observed = windows.with_brightness(
-            current,
-            windows.brightness_table(
-                previous,
-                current,
-                points,
-                guess,
-                self._config.klt_window,
-            ),
-        )
+        side = self._config.klt_window
+        table = windows.brightness_table(previous, current, points, guess, side)
+        observed = windows.with_brightness(current, table)
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
-        found, good = self._follow_and_return(
-            previous,
-            observed,
-            points,
-            guess,
-            levels,
-        )
+        found, good = self._follow_and_return(previous, observed, points, guess, levels)
         # Many losses: the motion was not the expected one. Losses of most: nor the predicted one.
         for start, most, wanted in (
             (predicted, _MOST_LOST, levels < all_levels),
@@ -345,8 +293,8 @@ class KltTracker:
                     previous, observed, points[lost], start[lost], all_levels
                 )
         off = found[good] - guess[good]
-        far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR) ** 2)
-        self._guesses_near = bool(far <= _MOST_FAR * len(off))
+        far = (off**2).sum(axis=1) > (0.5 * _NEAR) ** 2
+        self._guesses_near = bool(np.count_nonzero(far) <= _MOST_FAR * len(off))
         first, last = features.feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
         self._set(self._matches.followed(found), (found - predicted) / interval, good)
@@ -363,12 +311,7 @@ class KltTracker:
             and self._current is not None
             and self._current is not self._reference
         ):
-            refined, good = aligned(
-                self._matches,
-                self._reference,
-                self._current,
-                self._config,
-            )
+            refined, good = aligned(self._matches, self._reference, self._current, self._config)
             self._set(refined, self._unexplained, good)
         self._refined = True
         return self._matches
@@ -377,18 +320,14 @@ class KltTracker:
         """Make the current image the reference; tracks continue, new corners fill the gaps."""
         if self._current is None:
             raise InputError('the tracker has no current image: call start() first')
-        # Of tracks that merged the oldest is kept.
+        # Where tracks have merged the oldest one is kept.
         apart = features.keep_apart(self.points, 0.5 * self._config.min_feature_distance)
         kept = self.points[apart]
-        new = features.find_corners(
-            self._current, kept, self._config.max_features - len(kept), self._config
-        )
+        wanted = self._config.max_features - len(kept)
+        new = features.find_corners(self._current, kept, wanted, self._config)
         points = np.concatenate([kept, new])
-        self._matches = Matches(
-            np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))]),
-            np.stack([points, points]),
-            np.ones(len(points)),
-        )
+        ids = np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))])
+        self._matches = Matches(ids, np.stack([points, points]), np.ones(len(points)))
         self._unexplained = np.concatenate([self._unexplained[apart], np.zeros_like(new)])
         self._started = len(points)
         # The parallax of new corners is not known.
@@ -398,52 +337,37 @@ class KltTracker:
 
     # -- inside ------------------------------------------------------------------------------
 
-    def _set(self, matches: Matches, unexplained: Array, good: NDArray[np.bool_]) -> None:
+    def _set(self, matches: Matches, unexplained: Array, good: Flags) -> None:
         self._matches = matches.kept(good)
         self._unexplained = unexplained[good]
 
     def _follow_and_return(
-        self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int
-    ) -> tuple[Array, NDArray[np.bool_]]:
+        self,
+        image1: Image,
+        image2: Image,
+        points1: Array,
+        guess: Array,
+        levels: int,
+    ) -> tuple[Array, Flags]:
         """Points of `image2` that match `points1` (N, 2), and a mask of those tracked back."""
-        there = follow(
-            image1, image2, points1, guess, self._config.klt_window, levels, _TRACKING_CRITERIA
-        )
+        search = Search(self._config.klt_window, levels, _TRACKING_CRITERIA)
+        there = follow(image1, image2, points1, guess, search)
         # The way back starts as far off as the way forth: the guess must not be the answer.
         offset = there.points - guess
+
+        def returned(which: Flags, back: Search) -> Flags:
+            start = points1[which] + offset[which]
+            flow = follow(image2, image1, there.points[which], start, back)
+            error = np.linalg.norm(flow.points - points1[which], axis=1)
+            return flow.found & (error <= self._config.forward_backward_threshold)
+
         good = there.found.copy()
-        good[good] = self._return(
-            image2, image1, there.points[good], points1[good], offset[good], 1
-        )
+        good[good] = returned(there.found, search._replace(levels=1))
         # Without a pyramid near points are tracked back, and some of the far ones.
         far = there.found & ~good & (np.linalg.norm(offset, axis=1) > _NEAR)
         if levels > 1 and far.any():
-            good[far] = self._return(
-                image2, image1, there.points[far], points1[far], offset[far], levels
-            )
+            good[far] = returned(far, search)
         return there.points, good
-
-    def _return(
-        self,
-        image2: Image,
-        image1: Image,
-        found: Array,
-        points1: Array,
-        offset: Array,
-        levels: int,
-    ) -> NDArray[np.bool_]:
-        """Mask of the `found` points tracked back to `points1` from a guess off by `offset`."""
-        back = follow(
-            image2,
-            image1,
-            found,
-            points1 + offset,
-            self._config.klt_window,
-            levels,
-            _TRACKING_CRITERIA,
-        )
-        error = np.linalg.norm(back.points - points1, axis=1)
-        return back.found & (error <= self._config.forward_backward_threshold)
 
 
 def _usable(guess: Array, otherwise: Array, shape: tuple[int, ...]) -> Array:

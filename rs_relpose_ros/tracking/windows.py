@@ -1,4 +1,4 @@
-"""Windows around points: patches in one small image, their correlation and their exposure.
+"""Floatss around points: patches in one small image, their correlation and their exposure.
 
 OpenCV's Lucas-Kanade prepares a whole image for a few hundred windows. On a mosaic of patches its
 cost does not depend on the size of the image.
@@ -16,9 +16,11 @@ from rs_relpose_ros.geometry.so3 import median
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import Image
 
-Map = NDArray[np.float32]
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int64]
 
-# Beyond any image, and small enough for integers [px].
+# Points further away than this [px] are moved to it: a wrong prediction may be anywhere, and a
+# larger number overflows as an integer. [chosen: any value in 1e5..1e8 is outside of all images]
 _FARTHEST = 1e6
 
 
@@ -36,18 +38,11 @@ class Patches:
 
 def cut(image: Image, points: Array, radius: int) -> Patches:
     """Patches of ``2 radius + 1`` pixels around points (N, 2), the border repeated."""
-    centres = np.rint(np.clip(points, -_FARTHEST, _FARTHEST)).astype(np.int64)
-    side = 2 * radius + 1
-    shape, corners = _layout(len(points), side)
+    centres, corners, shape = _layout(points, radius)
     # The unused places of the last row are not read, hence not initialised.
     mosaic = np.empty(shape, dtype=np.uint8)
-    _copy(
-        image,
-        centres - radius,
-        side,
-        corners,
-        mosaic,
-    )
+    side = 2 * radius + 1
+    _copy(image, centres - radius, side, corners, mosaic)
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
@@ -59,39 +54,31 @@ def cut_warped(
     Pixel x of patch k, in the other image, has the value of this image at ``points + J (x -
     points1)`` for `points` (N, 2) here, `points1` (N, 2) there and `jacobians` (N, 2, 2).
     """
-    centres = np.rint(np.clip(points1, -_FARTHEST, _FARTHEST)).astype(np.int64)
-    side = 2 * radius + 1
-    shape, corners = _layout(len(points), side)
+    centres, corners, shape = _layout(points1, radius)
     # Pixels outside the patches are not read, but need valid coordinates.
-    x = np.zeros(shape, dtype=np.float32)
-    y = np.zeros(shape, dtype=np.float32)
-    _maps(
-        points,
-        jacobians,
-        centres - points1,
-        side,
-        corners,
-        x,
-        y,
-    )
+    x, y = np.zeros((2, *shape), dtype=np.float32)
+    _fill_maps(points, jacobians, centres - points1, radius, corners, x, y)
     mosaic: Image = cv2.remap(  # type: ignore[assignment]
         image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
-def _layout(count: int, side: int) -> tuple[tuple[int, int], NDArray[np.int64]]:
-    """Height and width of an image for so many patches, and their upper left corners (N, 2)."""
+def _layout(points: Array, radius: int) -> tuple[Integers, Integers, tuple[int, int]]:
+    """Centre pixels (N, 2) of patches, their upper left corners (N, 2) in one image, its shape."""
+    bounded = np.clip(points, -_FARTHEST, _FARTHEST)
+    count = len(points)
+    side = 2 * radius + 1
     columns = max(math.isqrt(max(count - 1, 0)) + 1, 1)
+    rows = max(-(-count // columns), 1)
     k = np.arange(count)
     corners = side * np.column_stack([k % columns, k // columns])
-    return (side * max(-(-count // columns), 1), side * columns), corners
+    return np.rint(bounded).astype(np.int64), corners, (side * rows, side * columns)
 
 
 @kernel
-def _copy(
-    image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64], mosaic: Image
-) -> None:
+def _copy(image: Image, first: Integers, side: int, corners: Integers, mosaic: Image) -> None:
+    """Copy squares of pixels from `first` (N, 2) on to their `corners` (N, 2) in the mosaic."""
     height, width = image.shape
     rows, columns = mosaic.shape
     pixels = image.reshape(height * width)
@@ -117,32 +104,33 @@ def _copy(
 
 
 @kernel
-def _maps(
+def _fill_maps(
     points: Array,
     jacobians: Array,
     offsets: Array,
-    side: int,
-    corners: NDArray[np.int64],
-    x: Map,
-    y: Map,
+    radius: int,
+    corners: Integers,
+    x: Floats,
+    y: Floats,
 ) -> None:
     """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
-    radius = side // 2
+    side = 2 * radius + 1
     for k in range(len(points)):
-        a = np.float32(jacobians[k, 0, 0])
-        c = np.float32(jacobians[k, 1, 0])
+        J = jacobians[k]
+        x_step = np.float32(J[0, 0])
+        y_step = np.float32(J[1, 0])
+        across = offsets[k, 0] - radius
         column = corners[k, 0]
-        row = corners[k, 1]
         for i in range(side):
-            across = offsets[k, 0] - radius
             down = offsets[k, 1] + i - radius
-            x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across + jacobians[k, 0, 1] * down)
-            y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across + jacobians[k, 1, 1] * down)
-            xs = x[row + i, column : column + side]
-            ys = y[row + i, column : column + side]
+            x0 = np.float32(points[k, 0] + J[0, 0] * across + J[0, 1] * down)
+            y0 = np.float32(points[k, 1] + J[1, 0] * across + J[1, 1] * down)
+            row = corners[k, 1] + i
+            xs = x[row, column : column + side]
+            ys = y[row, column : column + side]
             for j in range(side):
-                xs[j] = x0 + a * np.float32(j)
-                ys[j] = y0 + c * np.float32(j)
+                xs[j] = x0 + x_step * np.float32(j)
+                ys[j] = y0 + y_step * np.float32(j)
 
 
 @kernel
@@ -155,23 +143,22 @@ def _squares(image: Image, points: Array, side: int) -> Image:
         first[k, 1] = int(points[k, 1])
         corners[k, 1] = k * side
     out = np.empty((len(points) * side, side), dtype=np.uint8)
-    _copy(
-        image,
-        first,
-        side,
-        corners,
-        out,
-    )
+    _copy(image, first, side, corners, out)
     return out.reshape(len(points), side, side)
 
 
-# -- Correlation: vectorised by column, since in one running sum each addition waits for the last.
-# -- Rows are padded to the width of vector registers; sums leave the padding out.
+# -- Correlation of windows -----------------------------------------------------------------------
+#
+# Sums are kept by column, so that the compiler vectorises them: in one running sum each addition
+# waits for the one before. Rows are padded to the width of vector registers; the sums over the
+# columns leave the padding out.
 
-Window = NDArray[np.float32]
-
-# Numbers of 32 bits in a vector register of AVX2.
+# Numbers of 32 bits in a vector register. Another value gives the same result more slowly.
+# [derived: AVX2 has registers of 256 bits]
 _LANES = 8
+# Least variance of a window that has texture [gray^2]: below it, the variance is rounding, and the
+# correlation noise. [chosen: gray levels are integers, so that any value in 1e-9..1e-3 would do]
+_FLAT = 1e-6
 
 
 @kernel
@@ -200,18 +187,8 @@ def correlations(
     squares1 = _squares(image1, whole1 - side // 2, padded + 1)
     squares2 = _squares(image2, whole2 - side // 2, padded + 1)
     for k in range(count):
-        total1 = _sample(
-            squares1[k],
-            points1[k] - whole1[k],
-            window1,
-            power1,
-        )
-        total2 = _sample(
-            squares2[k],
-            points2[k] - whole2[k],
-            window2,
-            power2,
-        )
+        total1 = _sample(squares1[k], points1[k] - whole1[k], window1, power1)
+        total2 = _sample(squares2[k], points2[k] - whole2[k], window2, power2)
         mean1 = np.float32(total1 / pixels)
         mean2 = np.float32(total2 / pixels)
         power1[:] = 0.0
@@ -228,22 +205,16 @@ def correlations(
                 product[j] += off1 * off2
         total1 = _total(power1, side)
         total2 = _total(power2, side)
-        # The variance of a flat window is rounding.
-        if total1 > 1e-6 * pixels and total2 > 1e-6 * pixels:
+        if total1 > _FLAT * pixels and total2 > _FLAT * pixels:
             result[k] = _total(product, side) / math.sqrt(total1 * total2)
     return result
 
 
 @kernel
-def _sample(
-    square: Image,
-    shift: Array,
-    window: Window,
-    by_column: Window,
-) -> float:
+def _sample(square: Image, shift: Array, window: Floats, by_column: Floats) -> float:
     """Fill the `window` (side, padded) from a square of pixels, shifted by part of a pixel.
 
-    The sum of its pixels is returned, that of its columns written to `by_column` (padded,).
+    Returns the sum of its pixels, and writes the sums of its columns to `by_column` (padded,).
     """
     side, padded = window.shape
     dx = shift[0]
@@ -273,7 +244,7 @@ def _sample(
 
 
 @kernel
-def _total(by_column: Window, side: int) -> float:
+def _total(by_column: Floats, side: int) -> float:
     """Sum of the first `side` columns."""
     total = 0.0
     for j in range(side):
@@ -281,10 +252,12 @@ def _total(by_column: Window, side: int) -> float:
     return total
 
 
-# -- Exposure: Lucas-Kanade assumes constant brightness, which automatic exposure changes.
+# -- Exposure: Lucas-Kanade assumes constant brightness, which automatic exposure changes ---------
 
-# Smaller changes of exposure are not compensated: the second rounding to whole gray levels costs
-# more than it gains at faint texture (a RealSense recording: half the cost of 0.03 and 3).
+# Smallest changes of gain and of offset [gray] that are compensated. For smaller ones the second
+# rounding to whole gray levels costs more than it gains at faint texture; with larger limits,
+# windows of another brightness are tracked with a bias. [measured: on a RealSense recording, half
+# the cost of 0.03 and 3]
 _LEAST_GAIN = 0.1
 _LEAST_OFFSET = 10.0
 
@@ -294,7 +267,7 @@ def brightness_table(
 ) -> Image | None:
     """Gray level of the first image for each one of the second (256,); None if they agree.
 
-    Windows of `side` pixels around matches (N, 2) are compared in the original images:
+    Floatss of `side` pixels around matches (N, 2) are compared in the original images:
     interpolation smooths the noise and with it the contrast.
     """
     if not len(points1):
@@ -309,7 +282,8 @@ def brightness_table(
     offset = median(mean1 - gain * mean2)
     if abs(gain - 1.0) < _LEAST_GAIN and abs(offset) < _LEAST_OFFSET:
         return None
-    return np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
+    levels = np.round(gain * np.arange(256.0) + offset)
+    return np.clip(levels, 0.0, 255.0).astype(np.uint8)
 
 
 def with_brightness(image: Image, table: Image | None) -> Image:
@@ -323,7 +297,7 @@ def with_brightness(image: Image, table: Image | None) -> Image:
 
 @kernel
 def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
-    """Mean and standard deviation (N,) of the windows around `points` (N, 2), of whole pixels."""
+    """Mean and standard deviation (N,) of windows of whole pixels around `points` (N, 2)."""
     pixels = side * side
     windows = _squares(image, np.rint(points) - side // 2, side)
     mean = np.empty(len(points))
@@ -343,5 +317,6 @@ def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
             total += np.int64(row_total)
             squares += np.int64(row_squares)
         mean[k] = total / pixels
-        deviation[k] = math.sqrt(max(squares / pixels - mean[k] * mean[k], 0.0))
+        variance = squares / pixels - mean[k] * mean[k]
+        deviation[k] = math.sqrt(max(variance, 0.0))
     return mean, deviation
