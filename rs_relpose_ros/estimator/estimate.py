@@ -8,7 +8,7 @@ import numpy as np
 
 from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.core.least_squares import inverse
-from rs_relpose_ros.core.losses import Flags, noise_mixture
+from rs_relpose_ros.core.losses import noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import (
     covariance,
@@ -21,7 +21,7 @@ from rs_relpose_ros.estimator import (
 )
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
-from rs_relpose_ros.estimator.problem import to_reference_row, TwoViewProblem
+from rs_relpose_ros.estimator.problem import to_reference_row
 from rs_relpose_ros.estimator.result import Diagnostics, landmarks, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import SolverMode
 from rs_relpose_ros.estimator.sampson import RayMatches
@@ -29,29 +29,48 @@ from rs_relpose_ros.estimator.velocity import Refined
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.solvers.common import Solutions
 
-# Prior sigma of the velocities while hypotheses are compared [baselines per second].
+# Prior sigma of the velocities while hypotheses are compared [baselines per second]. With less,
+# the hypothesis of a fast camera loses against a slow one; with more, velocities absorb outliers.
+# [chosen: a baseline in a third of a second; the refinement chooses its own sigma]
 SAMPLING_VELOCITY_SIGMA = 3.0
-# Share of inliers at which the remaining solvers, with less prior knowledge, are skipped.
+# Share of inliers at which the remaining solvers, with less prior knowledge, are skipped. With
+# less, a wrong gyro could decide; with more, pairs with many outliers cost all solvers.
+# [chosen: no other hypothesis can have as many inliers]
 ENOUGH = 0.5
-# And at which the gyro's rotation with one direction of translation needs no other hypothesis.
+# Share of inliers at which the gyro's rotation with one direction of translation needs no other
+# hypothesis. [chosen: between ENOUGH and the share of a clean pair]
 CERTAIN = 0.75
 # First columns of the rays f_1 and f_2 in an observation.
 RAYS = (0, 9)
-# Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
+# A rotation alone explains matches that it leaves within this many sigmas in the median: pairs
+# below have no direction of translation. [derived: the noise of |f_1 - R f_2| is 1.67 sigma in the
+# median (Rayleigh, two images), and a parallax of as much again is in doubt]
 ROTATION_ONLY_SIGMAS = 2.5
-# Least chi-square of the acceleration (6 degrees of freedom; 99 % of pure noise lie below) and
-# largest 1 sigma of the logarithm of the baseline with which a baseline is given.
+# Least chi-square of the acceleration with which a baseline is given: pure noise has less in 99 %
+# of pairs. [derived: quantile of 6 degrees of freedom]
 LEAST_ACCELERATION = 16.8
+# Largest 1 sigma of the logarithm of a baseline that is given. [chosen: a factor of e; users get
+# the sigma, too]
 MOST_LOG_SIGMA = 1.0
 # Of matches within the threshold, half have implausible depths by chance: inliers must exceed the
-# others by this many sigmas of that.
+# others by this many sigmas of a fair coin. [derived: one of 700 pairs of chance passes]
 SIGN_SIGMAS = 3.0
 # Log-likelihood that all matches may gain by a free rotation. Three unknowns gain above 13 in one
-# of 100 000 pairs if residuals are independent; those of neighbours are similar (blur, stamps), as
-# if a fifth of the matches were (docs/estimator.md).
+# of 100 000 pairs if residuals are independent; residuals of neighbours are similar (blur,
+# stamps), as if a fifth of the matches were independent. [derived: docs/estimator.md]
 CONTRADICTION = 65.0
-# Points lie on a line if their root mean square distance from it is below this many thresholds.
+# Points lie on a line if their root mean square distance from it is below this many thresholds:
+# one threshold may be noise. [chosen: any value in 1.5..4 would do]
 DEGENERATE_THRESHOLDS = 2.0
+# Share of random matches that agree with the best of many fits, in thresholds by the focal length,
+# and its bound: free velocities bend the epipolar bands, so that the best fit has more matches
+# than a single one. [measured: fits to random matches]
+CHANCE_SHARE = 10.0
+MOST_BY_CHANCE = 0.5
+# Sigmas of that number beyond which agreement is no chance. [derived: one of a million pairs]
+CHANCE_SIGMAS = 5.0
+# Fewest inliers for the alternating refinement. [derived: 11 unknowns and one more]
+LEAST_ALTERNATING = 12
 
 
 def estimate(problem: PairProblem) -> RelativePose:
@@ -76,11 +95,12 @@ def evidence_for_inertial(
         return None
     motion = problem.config.motion
     views = problem.without_matches().two_views()
+    inertial = problem.inertial[-1]
     expected, _ = velocity.expected_velocities(
         views,
         motion,
         interval,
-        problem.inertial[-1],
+        inertial,
     )
     return velocity.inertial_evidence(
         views,
@@ -94,19 +114,17 @@ def evidence_for_inertial(
 def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> RelativePose:
     """The pose with the global-shutter pixels of its inliers."""
     camera = problem.camera
-    matches = problem.matches
     rays = []
-    times = []
-    for points, motion in (
-        (matches.points1, problem.motions[0]),
-        (matches.points2, problem.motions[-1]),
+    row_times = []
+    for points, motion in zip(
+        problem.matches.points[[0, -1]], (problem.motions[0], problem.motions[-1]), strict=True
     ):
-        times.append(camera.row_times(points[:, 1]))
-        rays.append(motion.derotate(camera.unproject(points), times[-1]))
+        row_times.append(camera.row_times(points[:, 1]))
+        rays.append(motion.derotate(camera.unproject(points), row_times[-1]))
     found = landmarks(
         pose,
         np.stack(rays),
-        np.stack(times),
+        np.stack(row_times),
         camera,
     )
     return replace(pose, pixels1_gs=found.pixels1, pixels2_gs=found.pixels2)
@@ -134,7 +152,6 @@ class Estimation:
     multi-scale MSAC, local optimisation of the uniform model with a shrinking threshold, joint MAP
     fit with the scale of the velocities chosen by its evidence (with `inertial`: the baseline),
     sandwich covariance over image regions.
-
     """
 
     def __init__(self, pair: PairProblem) -> None:
@@ -151,12 +168,7 @@ class Estimation:
         self.interval = pair.interval
         self.inertial = pair.inertial[-1]
         self.has_frames_between = len(pair.motions) > 2
-        self.priors = _priors(
-            problem,
-            self.mode,
-            config,
-            self.interval,
-        )
+        self.priors = self._sampling_priors()
         # Prior of the velocities by the measured acceleration, and the chi-square (6 degrees of
         # freedom) of that acceleration against zero.
         self.measured: VelocityPrior | None = None
@@ -166,6 +178,8 @@ class Estimation:
         self.deadline = time.perf_counter() + limit if limit > 0.0 else math.inf
         # Whether solvers were skipped, since one before them had enough inliers.
         self.solvers_skipped = False
+        # The state on its inliers, after step 3.
+        self.refined: Refined
 
     def run(self) -> RelativePose:
         """The pose of two views, or the reason why there is none.
@@ -200,9 +214,8 @@ class Estimation:
 
     def _share(self, state: TwoViewState) -> float:
         """Share of the matches that are inliers of a state."""
-        return float(
-            sampson.select_inliers(self.matches, state, self.config.threshold).sum()
-        ) / len(self.order)
+        use = sampson.select_inliers(self.matches, state, self.config.threshold)
+        return float(use.sum()) / len(self.order)
 
     def _by_gyro(self) -> TwoViewState | None:
         """The state from the gyro's rotation, if it explains the matches."""
@@ -210,41 +223,44 @@ class Estimation:
         if R is None or self.config.solver != 'auto' or self.config.refinement != 'map':
             return None
         t = sampling.translation_direction(self.problem.observations[self.problem.valid], R)
-        velocity = self.priors.velocity.rate * t
-        state = self._best(
-            Solutions(np.ascontiguousarray(R)[None], np.concatenate([t, velocity, velocity])[None])
-        )
+        expected = self.priors.velocity.rate * t
+        x = np.concatenate([t, expected, expected])
+        state = self._best(Solutions(np.ascontiguousarray(R)[None], x[None]))
         return state if state is not None and self._share(state) > CERTAIN else None
 
     def _completed(self, state: TwoViewState) -> RelativePose:
         """Steps 3 to 5, from the best state."""
         # 3. Refinement on its inliers.
-        refined = self._refined(state)
-        if reason := self._no_consensus(refined.inliers):
+        self.refined = self._refined(state)
+        if reason := self._no_consensus():
             return self._failure(Status.NO_CONSENSUS, reason)
-        if reason := self._contradiction(refined.state):
-            return self._failure(Status.NO_CONSENSUS, reason, rejected=self._result(refined))
+        if reason := self._contradiction():
+            return self._failure(Status.NO_CONSENSUS, reason, rejected=self._result())
         # 4. Is the translation observable?
-        rotation_only = self._rotation_only(refined)
+        rotation_only = self._rotation_only()
         if rotation_only is not None:
             return rotation_only
         # 5. Covariance at the optimum, then from the middle to the reference row.
-        pose = self._result(refined)
-        near = np.abs(sampson.residuals(self.problem.observations, refined.state))
-        implausible = (near < self.config.threshold) & ~refined.inliers
-        count = np.count_nonzero(refined.inliers)
-        others = np.count_nonzero(implausible)
-        if self.config.refinement == 'map' and (
-            count - others < SIGN_SIGMAS * math.sqrt(count + others)
-        ):
-            return pose.without_translation(
-                Status.LOW_PARALLAX,
-                (
-                    f'{others} of {count + others} matches on their epipolar lines lie behind the '
-                    'cameras or far from the others, nearly as many as by chance'
-                ),
-            )
+        pose = self._result()
+        if reason := self._sign_by_chance():
+            return pose.without_translation(Status.LOW_PARALLAX, reason)
         return pose
+
+    def _sign_by_chance(self) -> str:
+        """Reason why the matches do not determine the sign of t; empty if they do."""
+        if self.config.refinement != 'map':
+            return ''
+        use = self.refined.inliers
+        residuals = sampson.residuals(self.problem.observations, self.refined.state)
+        count = np.count_nonzero(use)
+        within = np.abs(residuals[~use]) < self.config.threshold
+        others = np.count_nonzero(within)
+        if count - others >= SIGN_SIGMAS * math.sqrt(count + others):
+            return ''
+        return (
+            f'{others} of {count + others} matches on their epipolar lines lie behind the '
+            'cameras or far from the others, nearly as many as by chance'
+        )
 
     def sample(self, enough: float = ENOUGH) -> Solutions:
         """The best hypotheses, by one solver after another until the inlier share is `enough`."""
@@ -268,28 +284,18 @@ class Estimation:
 
     def _in_front(self, state: TwoViewState) -> TwoViewState:
         """The state or its mirror image, whichever has more matches in front of the cameras."""
-        errors = np.abs(sampson.residuals(self.matches.observations, state))
-        near = (errors < self.config.threshold * sampling.SCALES[1]) & self.matches.valid
-        sign = sampson.cheirality_sign(self.matches.observations, near, state)
-        return priors.signed(state, sign)
+        observations = self.matches.observations
+        errors = np.abs(sampson.residuals(observations, state))
+        use = (errors < self.config.threshold * sampling.SCALES[1]) & self.matches.valid
+        return priors.signed(state, sampson.cheirality_sign(observations, use, state))
 
     def _refined(self, state: TwoViewState) -> Refined:
+        """The state on its inliers, by the refinement of the parameters."""
         config = self.config
         matches = self.matches
         model = self.mode.model
-        free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
-            prior = self.priors
-            scales = velocity.TIMELESS if free else velocity.AT_ZERO
-            if free and self.interval is not None:
-                expected, scales = velocity.expected_velocities(
-                    self.problem, config.motion, self.interval, self.inertial
-                )
-                prior = priors.with_velocity(prior, expected)
-                self.measured = None if self.inertial is None else expected
-                self.inertial_chi2 = float(
-                    expected.offset @ expected.information @ expected.offset
-                )
+            prior, scales = self._velocities(model.velocities or model.derotated)
             return velocity.fit_with_evidence(
                 matches,
                 state,
@@ -299,78 +305,94 @@ class Estimation:
                 scales,
                 self._gyro_error(),
             )
-        inliers = sampson.select_inliers(matches, state, config.threshold)
-        if config.refinement == 'alternating' and inliers.sum() >= 12:
-            used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
-            state = self._in_front(fit.refine_alternating(used, state, free))
-            inliers = sampson.select_inliers(matches, state, config.threshold)
-        used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
+        use = sampson.select_inliers(matches, state, config.threshold)
+        if config.refinement == 'alternating' and use.sum() >= LEAST_ALTERNATING:
+            weights = use.astype(float)
+            data = fit.FitMatches(matches.observations, weights, config.pixel_sigma)
+            state = self._in_front(fit.refine_alternating(data, state, model.velocities))
+            use = sampson.select_inliers(matches, state, config.threshold)
+        data = fit.FitMatches(matches.observations, use.astype(float), config.pixel_sigma)
         log_scale = self.priors.velocity.log_scale
         return Refined(
             state,
-            inliers,
+            use,
             log_scale,
             math.exp(-log_scale),
             config.pixel_sigma,
-            covariance.local_covariance(used, state, self.priors),
+            covariance.local_covariance(data, state, self.priors),
         )
+
+    def _velocities(self, free: bool) -> tuple[Priors, velocity.Scales]:
+        """Priors with the velocities that time, carrier and accelerometer let expect."""
+        if not free:
+            return self.priors, velocity.AT_ZERO
+        if self.interval is None:
+            return self.priors, velocity.TIMELESS
+        expected, scales = velocity.expected_velocities(
+            self.problem, self.config.motion, self.interval, self.inertial
+        )
+        if self.inertial is not None:
+            self.measured = expected
+        offset = expected.offset
+        self.inertial_chi2 = float(offset @ expected.information @ offset)
+        return priors.with_velocity(self.priors, expected), scales
 
     def _gyro_error(self) -> Array:
         """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
 
         The integration limits are in error: ``s^2 (w_1 w_1^T + w_2 w_2^T)``, w_2 rotated into
-        frame 1. Not part of the prior: with the lower weight, the poses of a recording with such
-        stamps were not more accurate (docs/estimator.md).
+        frame 1. It is no part of the prior: with the lower weight, the poses of a recording with
+        such stamps were not more accurate (docs/estimator.md).
         """
         problem = self.problem
         sigma = self.config.stamp_sigma
         if problem.rotation is None or sigma == 0.0:
             return np.zeros((3, 3))
-        rates = np.column_stack(
-            [problem.motion1.angular_velocity, problem.rotation @ problem.motion2.angular_velocity]
-        )
+        rate1 = problem.motion1.angular_velocity
+        rate2 = problem.rotation @ problem.motion2.angular_velocity
+        rates = np.column_stack([rate1, rate2])
         return np.asarray(sigma**2 * rates @ rates.T)
 
-    def _no_consensus(self, inliers: Flags) -> str:
+    def _no_consensus(self) -> str:
         """Reason why the inliers determine no pose; empty if they may."""
         config = self.config
         observations = self.problem.observations
+        use = self.refined.inliers
+        total = len(self.order)
         cell = config.threshold / self.problem.focal  # [rad]
         count = min(
             sampling.distinct_directions(
                 observations,
-                inliers,
+                use,
                 f,
                 cell,
             )
             for f in RAYS
         )
-        # Inliers of the best of many fits to random matches (about 5 sigma). Their share, ten
-        # thresholds by the focal length, was measured: free velocities bend the epipolar bands, so
-        # that the best fit has more than a single one.
-        expected = len(self.order) * min(10.0 * config.threshold / self.problem.focal, 0.5)
-        chance = int(expected + 5.0 * np.sqrt(expected)) + self.mode.fitted_points
+        expected = total * min(CHANCE_SHARE * cell, MOST_BY_CHANCE)
+        most = int(expected + CHANCE_SIGMAS * np.sqrt(expected))
+        chance = most + self.mode.fitted_points
         if count < max(config.min_inliers, chance):
             return (
-                f'{count} distinct of {len(self.order)} matches agree, fewer than '
+                f'{count} distinct of {total} matches agree, fewer than '
                 f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)'
             )
-        if (
-            min(sampling.distance_from_a_plane(observations, inliers, f) for f in RAYS)
-            < DEGENERATE_THRESHOLDS * cell
-        ):
+        spread = min(sampling.distance_from_a_plane(observations, use, f) for f in RAYS)
+        if spread < DEGENERATE_THRESHOLDS * cell:
             return f'the {count} matches that agree lie on one line: the pose is not observable'
         return ''
 
-    def _contradiction(self, state: TwoViewState) -> str:
+    def _contradiction(self) -> str:
         """Reason why images and gyro cannot both be right; empty if they may."""
-        if self.config.refinement != 'map' or self.problem.rotation is None:
+        problem = self.problem
+        if self.config.refinement != 'map' or problem.rotation is None:
             return ''
+        state = self.refined.state
         gain, R = sampling.gain_without_gyro(
             self.matches,
             state,
             self.priors,
-            self.problem.focal,
+            problem.focal,
         )
         if gain < CONTRADICTION:
             return ''
@@ -380,155 +402,162 @@ class Estimation:
             f"gyro's fits the matches better (log-likelihood +{gain:.0f})"
         )
 
-    def _rotation_only(self, refined: Refined) -> RelativePose | None:
+    def _rotation_only(self) -> RelativePose | None:
         """The result without a translation if none is observable, otherwise None.
 
         In front of a far plane a rotation alone may absorb nearly all of the motion, so it must
         fit the matches to within their noise, not to within some pixels.
         """
-        problem = self.problem
         config = self.config
-        state = refined.state
-        inliers = refined.inliers
-        sigma = refined.sigma
+        focal = self.problem.focal
+        observations = self.problem.observations
+        use = self.refined.inliers
+        R = np.ascontiguousarray(self.refined.state.R)
         parallax = so3.median(
             fit.transfer_errors(
-                problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal
+                observations,
+                use,
+                R,
+                focal,
             )
         )
         # Not from the rotation of the pose, which is arbitrary for points on a line.
-        start = so3.aligning_rotation(sampling.correlation(problem.observations, inliers, *RAYS))
+        start = so3.aligning_rotation(sampling.correlation(observations, use, *RAYS))
         R, information = fit.fit_rotation(
-            problem.observations, inliers, start, self.priors, problem.focal, sigma
+            observations, use, start, self.priors, focal, self.refined.sigma
         )
-        left = fit.transfer_errors(
-            problem.observations,
-            inliers,
+        residuals = fit.transfer_errors(
+            observations,
+            use,
             R,
-            problem.focal,
+            focal,
         )
-        median = so3.median(left.copy())
-        pure_rotation = median < ROTATION_ONLY_SIGMAS * sigma
-        if not pure_rotation and parallax >= config.min_parallax:
-            return None
-        reason = (
-            (
+        rms = float(np.sqrt(np.mean(residuals**2)))
+        median = so3.median(residuals)
+        if median < ROTATION_ONLY_SIGMAS * self.refined.sigma:
+            status = Status.PURE_ROTATION
+            reason = (
                 f'a rotation alone leaves {median:.2f} px in the median, the noise of '
                 'the matches: the translation is not observable'
             )
-            if pure_rotation
-            else (
+        elif parallax < config.min_parallax:
+            status = Status.LOW_PARALLAX
+            reason = (
                 f'median parallax of {parallax:.2f} px is below min_parallax = '
                 f'{config.min_parallax:g} px'
             )
+        else:
+            return None
+        pose = self._rotation(R, information)
+        diagnostics = replace(pose.diagnostics, residual_rms=rms)
+        return replace(
+            pose,
+            status=status,
+            reason=reason,
+            diagnostics=diagnostics,
         )
+
+    def _rotation(self, R: Array, information: Array) -> RelativePose:
+        """The result of a rotation (3, 3) between the middle rows, with its information (3, 3)."""
+        problem = self.problem
         # Back to the reference row, without the translation.
         turn1, turn2 = self._rotations_to_reference_row(
-            state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3))
+            self.refined.state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3))
         )
-        of_pose = np.full((6, 6), np.nan)
         # No rotation has a sigma above half a turn: points in one place determine two angles only.
         fitted = inverse(information + np.eye(3) / np.pi**2)
-        of_gyro = fitted @ self.priors.rotation_information
-        of_pose[3:, 3:] = turn1.T @ (fitted + of_gyro @ self._gyro_error() @ of_gyro.T) @ turn1
+        by_gyro = fitted @ self.priors.rotation_information
+        spread = fitted + by_gyro @ self._gyro_error() @ by_gyro.T
+        of_pose = np.full((6, 6), np.nan)
+        of_pose[3:, 3:] = turn1.T @ spread @ turn1
         # The rates and their covariance are the gyro's.
-        velocity_covariance = np.full((6, 6), np.nan)
-        velocity_covariance[3:, 3:] = config.gyro_sigma**2 * np.eye(3)
+        of_velocity = np.full((6, 6), np.nan)
+        of_velocity[3:, 3:] = self.config.gyro_sigma**2 * np.eye(3)
+        images = covariance.rotation_information(
+            R,
+            information,
+            self.priors.rotation_information,
+            so3.log_so3(R @ self.priors.rotation.T),
+            -problem.reference_row_time,
+        )
         return RelativePose(
-            status=Status.PURE_ROTATION if pure_rotation else Status.LOW_PARALLAX,
-            reason=reason,
+            Status.PURE_ROTATION,
             R=turn1.T @ R @ turn2,
             covariance=of_pose,
-            inliers=inliers,
-            images=covariance.rotation_information(
-                R,
-                information,
-                self.priors.rotation_information,
-                so3.log_so3(R @ self.priors.rotation.T),
-                -problem.reference_row_time,
-            ),
+            inliers=self.refined.inliers,
+            images=images,
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
-            velocity_covariance=velocity_covariance,
-            diagnostics=Diagnostics(
-                model='angular',
-                iterations=self.iterations,
-                residual_rms=float(np.sqrt(np.mean(left**2))),
-            ),
+            velocity_covariance=of_velocity,
+            diagnostics=Diagnostics(model='angular', iterations=self.iterations),
         )
 
     def _rotations_to_reference_row(self, state: TwoViewState) -> tuple[Array, Array]:
         """Rotation of each camera from the middle row to the reference row, as corrected."""
         if not self.mode.model.derotated:
             return np.eye(3), np.eye(3)
-        problem = self.problem
         delay = self.problem.reference_row_time
-        turn1 = problem.motion1.rotations([delay])[0]
-        turn2 = problem.motion2.rotations([delay])[0]
-        return (
-            so3.exp_so3(delay * state.dw1) @ turn1,
-            so3.exp_so3(delay * (state.R.T @ state.dw2)) @ turn2,
-        )
+        turn1 = self.problem.motion1.rotations([delay])[0]
+        turn2 = self.problem.motion2.rotations([delay])[0]
+        corrected1 = so3.exp_so3(delay * state.dw1)
+        corrected2 = so3.exp_so3(delay * (state.R.T @ state.dw2))
+        return corrected1 @ turn1, corrected2 @ turn2
 
-    def _result(self, refined: Refined) -> RelativePose:
+    def _result(self) -> RelativePose:
+        """The refined state as a pose between the reference rows."""
+        problem = self.problem
+        refined = self.refined
         at_middle = covariance.pair_state(
-            self.problem, refined.state, refined.log_scale, refined.covariance
+            problem, refined.state, refined.log_scale, refined.covariance
         )
-        pose = to_reference_row(
-            at_middle,
-            self.problem.reference_row_time,
-            *self._rotations_to_reference_row(refined.state),
-        )
-        r = sampson.residuals(self.problem.observations, refined.state)[refined.inliers]
+        turns = self._rotations_to_reference_row(refined.state)
+        pose = to_reference_row(at_middle, problem.reference_row_time, *turns)
+        residuals = sampson.residuals(problem.observations, refined.state)
+        images = self._images(residuals)
+        sigma = math.sqrt(max(pose.covariance[18, 18], 0.0))
+        no_baseline = self._no_baseline(sigma)
         v2w2 = np.r_[9:12, 15:18]
-        baseline, baseline_sigma, reason = self._baseline(
-            pose.log_baseline, pose.covariance[18, 18]
-        )
-        images = self._images(refined)
         return RelativePose(
             status=Status.OK,
             R=pose.R,
             t=pose.t,
+            covariance=pose.covariance[:6, :6],
             linear_velocity1=pose.v1,
             linear_velocity2=pose.v2,
             angular_velocity1=pose.w1,
             angular_velocity2=pose.w2,
-            inliers=refined.inliers,
-            covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)],
-            baseline=baseline,
-            baseline_log_sigma=baseline_sigma,
+            baseline=math.nan if no_baseline else math.exp(pose.log_baseline),
+            baseline_log_sigma=math.nan if no_baseline else sigma,
+            inliers=refined.inliers,
             images=images,
             diagnostics=Diagnostics(
                 model=self.mode.model.name,
                 iterations=self.iterations,
-                residual_rms=float(np.sqrt(np.mean(r**2))),
+                residual_rms=float(np.sqrt(np.mean(residuals[refined.inliers] ** 2))),
                 pixel_sigma=refined.sigma,
                 velocity_sigma=refined.velocity_sigma,
-                baseline_reason=reason,
+                baseline_reason=no_baseline,
                 inertial_evidence=self._evidence(images),
             ),
         )
 
-    def _images(self, refined: Refined) -> covariance.ImageInformation | None:
+    def _images(self, residuals: Array) -> covariance.ImageInformation | None:
         """Information of the images alone; None for models without all unknowns."""
         if not self.mode.model.derotated:
             return None
-        state = refined.state
-        observations = self.problem.observations
-        weights, sigma = noise_mixture(
-            sampson.residuals(observations, state), refined.inliers, self.config.pixel_sigma
-        )
+        weights, sigma = noise_mixture(residuals, self.refined.inliers, self.config.pixel_sigma)
+        data = fit.FitMatches(self.problem.observations, weights, sigma)
+        row_time = -self.problem.reference_row_time
         return covariance.image_information(
-            fit.FitMatches(observations, weights, sigma),
-            state,
+            data,
+            self.refined.state,
             self.priors,
-            -self.problem.reference_row_time,
+            row_time,
         )
 
     def _evidence(
-        self,
-        images: covariance.ImageInformation | None,
+        self, images: covariance.ImageInformation | None
     ) -> velocity.InertialEvidence | None:
         """Whether the images are consistent with the measured acceleration."""
         if images is None or self.measured is None or self.interval is None:
@@ -537,34 +566,20 @@ class Estimation:
             self.problem, images, self.config.motion, self.interval, self.measured
         )
 
-    def _baseline(self, log_baseline: float, variance: float) -> tuple[float, float, str]:
-        """Baseline [m] and 1 sigma of its logarithm; or NaN twice and the reason."""
+    def _no_baseline(self, sigma: float) -> str:
+        """Why the baseline is not known, empty if it is; `sigma`: of its logarithm."""
         if self.inertial is None:
-            return (
-                math.nan,
-                math.nan,
-                ('baseline not known: no acceleration between the frames is given (inertial)'),
-            )
-        sigma = math.sqrt(max(variance, 0.0))
+            return 'baseline not known: no acceleration between the frames is given (inertial)'
         if self.inertial_chi2 < LEAST_ACCELERATION:
             return (
-                math.nan,
-                math.nan,
-                (
-                    'baseline not known: the acceleration between the frames '
-                    'is within its own errors'
-                ),
+                'baseline not known: the acceleration between the frames is within its own errors'
             )
         if not (self.mode.model.derotated and sigma <= MOST_LOG_SIGMA):
             return (
-                math.nan,
-                math.nan,
-                (
-                    'baseline not known: not observable from the velocities '
-                    'in the images and the acceleration'
-                ),
+                'baseline not known: not observable from the velocities '
+                'in the images and the acceleration'
             )
-        return math.exp(log_baseline), sigma, ''
+        return ''
 
     def _failure(
         self, status: Status, reason: str, rejected: RelativePose | None = None
@@ -578,42 +593,45 @@ class Estimation:
             ),
         )
 
+    def _sampling_priors(self) -> Priors:
+        """Priors of the IMU; velocities with the wide prior of the comparison of hypotheses."""
+        problem = self.problem
+        config = self.config
+        model = self.mode.model
+        directions = []
+        for gravity in (problem.motion1.gravity, problem.motion2.gravity):
+            if gravity is not None:
+                directions.append(gravity / np.linalg.norm(gravity))
+        known = len(directions) == 2
+        gravity1, gravity2 = directions if known else np.zeros((2, 3))
+        rotation = np.eye(3) if problem.rotation is None else problem.rotation
+        information = problem.rotation_information
+        if information is None:
+            information = np.zeros((3, 3))
+        free = model.velocities or model.derotated
+        rate = 1.0 / self.interval if free and self.interval is not None else 0.0
+        sigma = SAMPLING_VELOCITY_SIGMA if free else priors.PINNED**-0.5
+        return Priors(
+            gravity1,
+            gravity2,
+            config.gravity_sigma**-2 if known else 0.0,
+            problem.reference_row_time,
+            config.gyro_sigma**-2 if model.derotated else priors.PINNED,
+            np.ascontiguousarray(rotation),
+            np.ascontiguousarray(information),
+            priors.isotropic(sigma, rate),
+        )
+
 
 def _mode(pair: PairProblem) -> SolverMode:
     """Mode of the solver; it may need gravity."""
     name = pair.config.solver
     mode = sampling.MODES[name]
-    if mode.needs_gravity and (
-        pair.motions[0].gravity is None or pair.motions[-1].gravity is None
-    ):
+    first = pair.motions[0]
+    last = pair.motions[-1]
+    if mode.needs_gravity and (first.gravity is None or last.gravity is None):
         raise InputError(
             f'solver {name!r} requires gravity in both frames; without it, '
             'use auto, uniform_11pt or angular_5pt'
         )
     return mode
-
-
-def _priors(
-    problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig, interval: float | None
-) -> Priors:
-    """Priors of the IMU; velocities with the wide prior of the comparison of hypotheses."""
-    g1 = problem.motion1.gravity
-    g2 = problem.motion2.gravity
-    known = g1 is not None and g2 is not None
-    free = mode.model.velocities or mode.model.derotated
-    unit1, unit2 = (np.zeros(3) if g is None else g / np.linalg.norm(g) for g in (g1, g2))
-    rotation = problem.rotation
-    information = problem.rotation_information
-    return Priors(
-        unit1,
-        unit2,
-        config.gravity_sigma**-2 if known else 0.0,
-        problem.reference_row_time,
-        config.gyro_sigma**-2 if mode.model.derotated else priors.PINNED,
-        np.eye(3) if rotation is None else np.ascontiguousarray(rotation),
-        np.zeros((3, 3)) if information is None else np.ascontiguousarray(information),
-        priors.isotropic(
-            SAMPLING_VELOCITY_SIGMA if free else priors.PINNED**-0.5,
-            1.0 / interval if free and interval is not None else 0.0,
-        ),
-    )

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 import math
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,6 +82,11 @@ class Diagnostics:
     inertial_evidence: InertialEvidence | None = None
     rejected: RelativePose | None = None
     duration: float = math.nan
+
+
+def _of_diagnostics(name: str) -> Any:
+    """A property of a pose that is an attribute of its diagnostics."""
+    return property(attrgetter(f'diagnostics.{name}'), doc=f'`diagnostics.{name}`.')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,66 +227,18 @@ class RelativePose:
         )
 
     # Attributes of earlier releases, now of `diagnostics`.
-
-    @property
-    def model(self) -> str:
-        """Model of the estimate."""
-        return self.diagnostics.model
-
-    @property
-    def iterations(self) -> int:
-        """Hypothesis samples drawn."""
-        return self.diagnostics.iterations
-
-    @property
-    def residual_rms(self) -> float:
-        """Root mean square residual [px]."""
-        return self.diagnostics.residual_rms
-
-    @property
-    def pixel_sigma(self) -> float:
-        """Noise of a match [px]."""
-        return self.diagnostics.pixel_sigma
-
-    @property
-    def velocity_sigma(self) -> float:
-        """Prior sigma of the velocities [baselines per second]."""
-        return self.diagnostics.velocity_sigma
-
-    @property
-    def frames(self) -> int:
-        """Number of views."""
-        return self.diagnostics.frames
-
-    @property
-    def frames_reason(self) -> str:
-        """Why given frames between were not used."""
-        return self.diagnostics.frames_reason
-
-    @property
-    def gyro_square(self) -> float:
-        """Chi-square of the rotation by the gyro's."""
-        return self.diagnostics.gyro_square
-
-    @property
-    def baseline_reason(self) -> str:
-        """Why the baseline is not known."""
-        return self.diagnostics.baseline_reason
-
-    @property
-    def inertial_evidence(self) -> InertialEvidence | None:
-        """Consistency of the images with the acceleration."""
-        return self.diagnostics.inertial_evidence
-
-    @property
-    def rejected(self) -> RelativePose | None:
-        """The estimate that images and gyro contradict."""
-        return self.diagnostics.rejected
-
-    @property
-    def duration(self) -> float:
-        """Time of the estimate [s]."""
-        return self.diagnostics.duration
+    model = _of_diagnostics('model')
+    iterations = _of_diagnostics('iterations')
+    residual_rms = _of_diagnostics('residual_rms')
+    pixel_sigma = _of_diagnostics('pixel_sigma')
+    velocity_sigma = _of_diagnostics('velocity_sigma')
+    frames = _of_diagnostics('frames')
+    frames_reason = _of_diagnostics('frames_reason')
+    gyro_square = _of_diagnostics('gyro_square')
+    baseline_reason = _of_diagnostics('baseline_reason')
+    inertial_evidence = _of_diagnostics('inertial_evidence')
+    rejected = _of_diagnostics('rejected')
+    duration = _of_diagnostics('duration')
 
 
 # -- Landmarks and equivalent global-shutter pixels -----------------------------------------------

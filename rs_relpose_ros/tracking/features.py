@@ -61,12 +61,22 @@ def find_corners(
     free[top:bottom, margin:-margin] = 255
     free[-margin:] = 0
     _occupy(free, taken / scale, math.ceil(distance))
-    points = scale * _strong_corners(image, free, distance, config.feature_quality)
+    points = scale * _strong_corners(
+        image,
+        free,
+        distance,
+        config.feature_quality,
+    )
     cell = math.sqrt(height * width / config.max_features)
     return points[_spread(points, taken, cell)[:count]]
 
 
-def _strong_corners(image: Image, free: Image, distance: float, least: float) -> Array:
+def _strong_corners(
+    image: Image,
+    free: Image,
+    distance: float,
+    least: float,
+) -> Array:
     """Corners (N, 2) at nonzero pixels of `free` (H, W), best first, at a mutual distance.
 
     `least`: smallest eigenvalue of the structure tensor [gray^2/px^2].
@@ -261,7 +271,12 @@ class DescriptorTracker:
         distances, nearest = self._nearest(first.descriptors, second.descriptors, 2)
         best, other = distances.T
         # Two equally good neighbours, even perfect ones, are no match.
-        ratio = np.divide(best, other, out=np.ones_like(best), where=other > 0.0)
+        ratio = np.divide(
+            best,
+            other,
+            out=np.ones_like(best),
+            where=other > 0.0,
+        )
         matched = np.flatnonzero(ratio < self._config.match_ratio)
         partners = nearest[matched, 0]
         if len(matched):

@@ -83,7 +83,13 @@ class Flow(NamedTuple):
     strength: Array  # (N,) [gray^2/px^2] smallest eigenvalue of each window's structure tensor
 
 
-def follow(image1: Image, image2: Image, points1: Array, guess: Array, search: Search) -> Flow:
+def follow(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    guess: Array,
+    search: Search,
+) -> Flow:
     """Points of `image2` near the `guess` (N, 2) that match `points1` (N, 2) of `image1`."""
     if not len(points1):
         return Flow(points1, np.empty(0, dtype=bool), np.empty(0))
@@ -93,11 +99,29 @@ def follow(image1: Image, image2: Image, points1: Array, guess: Array, search: S
             # As in a pyramid: the coarse level gives the start of the fine one.
             half1: Image = cv2.pyrDown(image1)  # type: ignore[assignment]
             half2: Image = cv2.pyrDown(image2)  # type: ignore[assignment]
-            coarse = _near(half1, half2, 0.5 * points1, 0.5 * guess, search)
+            coarse = _near(
+                half1,
+                half2,
+                0.5 * points1,
+                0.5 * guess,
+                search,
+            )
             guess = np.where(coarse.found[:, None], 2.0 * coarse.points, guess)
-        flow = _near(image1, image2, points1, guess, search)
+        flow = _near(
+            image1,
+            image2,
+            points1,
+            guess,
+            search,
+        )
     else:
-        flow = whole_images(image1, image2, points1, guess, search)
+        flow = whole_images(
+            image1,
+            image2,
+            points1,
+            guess,
+            search,
+        )
     return flow._replace(found=flow.found & inside(image2, flow.points))
 
 
@@ -135,7 +159,13 @@ def whole_images(
     )
 
 
-def _near(image1: Image, image2: Image, points1: Array, guess: Array, search: Search) -> Flow:
+def _near(
+    image1: Image,
+    image2: Image,
+    points1: Array,
+    guess: Array,
+    search: Search,
+) -> Flow:
     """`follow` on patches, which end `_REACH` pixels from the guess."""
     radius = patch_radius(search.side, _REACH)
     first = windows.cut(image1, points1, radius)
@@ -167,16 +197,40 @@ def aligned(
     search = Search(config.klt_window, 1, _ALIGNMENT_CRITERIA)
     radius = patch_radius(search.side, math.ceil(_LARGEST_CORRECTION))
     jacobians = window_jacobians(points1, points2)
-    there = windows.cut_warped(current, points2, jacobians, radius, points1)
+    there = windows.cut_warped(
+        current,
+        points2,
+        jacobians,
+        radius,
+        points1,
+    )
     here = windows.cut(reference, points1, radius)
-    table = windows.brightness_table(reference, current, points1, points2, search.side)
+    table = windows.brightness_table(
+        reference,
+        current,
+        points1,
+        points2,
+        search.side,
+    )
     image = windows.with_brightness(there.image, table)
     start = points1 + here.shifts
-    flow = whole_images(here.image, image, start, start, search)
+    flow = whole_images(
+        here.image,
+        image,
+        start,
+        start,
+        search,
+    )
     # From the pixels of the reference to those of the current image: p2 + J (x - p1).
     correction = np.einsum('nij,nj->ni', jacobians, flow.points - start)
     found = points2 + correction
-    correlation = windows.correlations(here.image, image, start, flow.points, search.side)
+    correlation = windows.correlations(
+        here.image,
+        image,
+        start,
+        flow.points,
+        search.side,
+    )
     # Patches repeat the border of the image: a match there is not in the image.
     good = (
         flow.found
@@ -276,12 +330,24 @@ class KltTracker:
         predicted = points if predicted is None else _usable(predicted, points, image.shape)
         guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
         side = self._config.klt_window
-        table = windows.brightness_table(previous, current, points, guess, side)
+        table = windows.brightness_table(
+            previous,
+            current,
+            points,
+            guess,
+            side,
+        )
         observed = windows.with_brightness(current, table)
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
-        found, good = self._follow_and_return(previous, observed, points, guess, levels)
+        found, good = self._follow_and_return(
+            previous,
+            observed,
+            points,
+            guess,
+            levels,
+        )
         # Many losses: the motion was not the expected one. Losses of most: nor the predicted one.
         for start, most, wanted in (
             (predicted, _MOST_LOST, levels < all_levels),
@@ -311,7 +377,12 @@ class KltTracker:
             and self._current is not None
             and self._current is not self._reference
         ):
-            refined, good = aligned(self._matches, self._reference, self._current, self._config)
+            refined, good = aligned(
+                self._matches,
+                self._reference,
+                self._current,
+                self._config,
+            )
             self._set(refined, self._unexplained, good)
         self._refined = True
         return self._matches
@@ -324,7 +395,12 @@ class KltTracker:
         apart = features.keep_apart(self.points, 0.5 * self._config.min_feature_distance)
         kept = self.points[apart]
         wanted = self._config.max_features - len(kept)
-        new = features.find_corners(self._current, kept, wanted, self._config)
+        new = features.find_corners(
+            self._current,
+            kept,
+            wanted,
+            self._config,
+        )
         points = np.concatenate([kept, new])
         ids = np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))])
         self._matches = Matches(ids, np.stack([points, points]), np.ones(len(points)))
@@ -351,13 +427,25 @@ class KltTracker:
     ) -> tuple[Array, Flags]:
         """Points of `image2` that match `points1` (N, 2), and a mask of those tracked back."""
         search = Search(self._config.klt_window, levels, _TRACKING_CRITERIA)
-        there = follow(image1, image2, points1, guess, search)
+        there = follow(
+            image1,
+            image2,
+            points1,
+            guess,
+            search,
+        )
         # The way back starts as far off as the way forth: the guess must not be the answer.
         offset = there.points - guess
 
         def returned(which: Flags, back: Search) -> Flags:
             start = points1[which] + offset[which]
-            flow = follow(image2, image1, there.points[which], start, back)
+            flow = follow(
+                image2,
+                image1,
+                there.points[which],
+                start,
+                back,
+            )
             error = np.linalg.norm(flow.points - points1[which], axis=1)
             return flow.found & (error <= self._config.forward_backward_threshold)
 

@@ -42,7 +42,13 @@ def cut(image: Image, points: Array, radius: int) -> Patches:
     # The unused places of the last row are not read, hence not initialised.
     mosaic = np.empty(shape, dtype=np.uint8)
     side = 2 * radius + 1
-    _copy(image, centres - radius, side, corners, mosaic)
+    _copy(
+        image,
+        centres - radius,
+        side,
+        corners,
+        mosaic,
+    )
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
@@ -57,7 +63,15 @@ def cut_warped(
     centres, corners, shape = _layout(points1, radius)
     # Pixels outside the patches are not read, but need valid coordinates.
     x, y = np.zeros((2, *shape), dtype=np.float32)
-    _fill_maps(points, jacobians, centres - points1, radius, corners, x, y)
+    _fill_maps(
+        points,
+        jacobians,
+        centres - points1,
+        radius,
+        corners,
+        x,
+        y,
+    )
     mosaic: Image = cv2.remap(  # type: ignore[assignment]
         image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -77,7 +91,13 @@ def _layout(points: Array, radius: int) -> tuple[Integers, Integers, tuple[int, 
 
 
 @kernel
-def _copy(image: Image, first: Integers, side: int, corners: Integers, mosaic: Image) -> None:
+def _copy(
+    image: Image,
+    first: Integers,
+    side: int,
+    corners: Integers,
+    mosaic: Image,
+) -> None:
     """Copy squares of pixels from `first` (N, 2) on to their `corners` (N, 2) in the mosaic."""
     height, width = image.shape
     rows, columns = mosaic.shape
@@ -143,7 +163,13 @@ def _squares(image: Image, points: Array, side: int) -> Image:
         first[k, 1] = int(points[k, 1])
         corners[k, 1] = k * side
     out = np.empty((len(points) * side, side), dtype=np.uint8)
-    _copy(image, first, side, corners, out)
+    _copy(
+        image,
+        first,
+        side,
+        corners,
+        out,
+    )
     return out.reshape(len(points), side, side)
 
 
@@ -187,8 +213,18 @@ def correlations(
     squares1 = _squares(image1, whole1 - side // 2, padded + 1)
     squares2 = _squares(image2, whole2 - side // 2, padded + 1)
     for k in range(count):
-        total1 = _sample(squares1[k], points1[k] - whole1[k], window1, power1)
-        total2 = _sample(squares2[k], points2[k] - whole2[k], window2, power2)
+        total1 = _sample(
+            squares1[k],
+            points1[k] - whole1[k],
+            window1,
+            power1,
+        )
+        total2 = _sample(
+            squares2[k],
+            points2[k] - whole2[k],
+            window2,
+            power2,
+        )
         mean1 = np.float32(total1 / pixels)
         mean2 = np.float32(total2 / pixels)
         power1[:] = 0.0
@@ -211,7 +247,12 @@ def correlations(
 
 
 @kernel
-def _sample(square: Image, shift: Array, window: Floats, by_column: Floats) -> float:
+def _sample(
+    square: Image,
+    shift: Array,
+    window: Floats,
+    by_column: Floats,
+) -> float:
     """Fill the `window` (side, padded) from a square of pixels, shifted by part of a pixel.
 
     Returns the sum of its pixels, and writes the sums of its columns to `by_column` (padded,).
