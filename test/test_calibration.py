@@ -17,14 +17,11 @@ from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorde
 from rs_relpose_ros.calibrate import coplanarity, observations
 from rs_relpose_ros.calibrate import fit as fitting
 from rs_relpose_ros.calibrate.coplanarity import (
-    BIAS,
-    CENTER,
     EXPOSURE,
     GLOBAL,
     LENS,
     OFFSET,
     READOUT,
-    ROTATION,
     SLOPE,
 )
 from rs_relpose_ros.calibrate.fit import (
@@ -57,6 +54,9 @@ from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.
+# First places of entries with more than one value.
+BIAS, CENTER = coplanarity.BIAS.start, coplanarity.CENTER.start
+ROTATION = coplanarity.ROTATION.start
 MODELS = {
     'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
     'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
@@ -646,7 +646,7 @@ def test_errors_of_lens_and_gyro_are_added():
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
     # A gyro whose rates are 0.5 % larger has a bias that is 0.5 % larger, at least.
     bias = np.abs(recorded().truth.gyro_bias)
-    assert (np.sqrt(np.diag(difference)[BIAS : BIAS + 3]) > 0.3 * errors.gyro_scale * bias).all()
+    assert (np.sqrt(np.diag(difference)[coplanarity.BIAS]) > 0.3 * errors.gyro_scale * bias).all()
     none = widened(final, ModelErrors(*[0.0] * len(errors)))
     np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-9)
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.arguments import estimate_relative_pose
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
@@ -50,9 +51,10 @@ from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 from rs_relpose_ros.pipeline.recursion import pair_information, PairData, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, rotation_of_rays, RotationSums
 
-AXES, OFFSET, READOUT, BIAS = findings.AXES, findings.OFFSET, findings.READOUT, findings.BIAS
-SCALE, FOCAL, DISTORTION = findings.SCALE, findings.FOCAL, findings.DISTORTION
-DEVIATIONS = findings.DEVIATIONS
+AXES, BIAS = LIVE.part('axes'), LIVE.part('gyro_bias')
+OFFSET, READOUT = LIVE.index('time_offset'), LIVE.index('readout_time')
+SCALE, FOCAL, DISTORTION = map(LIVE.index, ('gyro_scale', 'focal_log', 'distortion'))
+DEVIATIONS = LIVE.size
 MS = 1_000_000
 NONE = np.zeros(DEVIATIONS)
 GYRO_NOISE = ImuConfig().gyro_noise_density
@@ -81,7 +83,7 @@ def deviation(**values):
     """(11,) of quantities by name."""
     c = np.zeros(DEVIATIONS)
     for name, value in values.items():
-        c[getattr(findings, name.upper())] = value
+        c[LIVE.part(name)] = value
     return c
 
 
@@ -171,7 +173,7 @@ def solved(pairs, active, about):
 
 def test_pairs_are_exact_at_times_that_are_far_off():
     """Linearised about the truth, they are solved to it, once the gyro after them is known."""
-    c, linear, exact = deviation(offset=0.03), *(recursion.Recursion() for _ in range(2))
+    c, linear, exact = deviation(time_offset=0.03), *(recursion.Recursion() for _ in range(2))
     for k in range(9):
         for found in linear, exact:
             found.add(k, pair_data(0.3 * k, 0.3 * (k + 1), c), NONE, c)
@@ -327,7 +329,7 @@ def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
         sums.add(stamp_ns, pair, NONE, NONE)
         assert len(sums.solved().b) == left
     assert Recursion().solved() is recursion.NOTHING_ESTIMATED
-    np.testing.assert_array_equal(recursion.NOTHING_ESTIMATED.sigma, recursion.PRIOR_SIGMA)
+    np.testing.assert_array_equal(recursion.NOTHING_ESTIMATED.sigma, LIVE.sigmas)
 
 
 # -- rotations of images and gyro ----------------------------------------------------------------
@@ -536,7 +538,7 @@ def calibration(c, sigma, coupled=0.0):
     correlation = np.eye(DEVIATIONS)
     correlation[OFFSET, READOUT] = correlation[READOUT, OFFSET] = coupled
     S = correlation / np.outer(sigma, sigma)
-    covariance = np.linalg.inv(S + np.diag(recursion.PRIOR_SIGMA**-2.0))
+    covariance = np.linalg.inv(S + np.diag(LIVE.sigmas**-2.0))
     pairs = np.tile(S / 20, (20, 1, 1))
     return recursion.Calibration(
         np.asarray(c), covariance, pairs, pairs @ c, np.ones(20), np.asarray(c), 1.0, 1.0, 1.0
@@ -561,9 +563,9 @@ def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
     ('c', 'coupled', 'named'),
     [
         # Not distributed among similar quantities.
-        (deviation(offset=0.01), 0.95, {'time_offset'}),
-        (deviation(offset=0.01, readout=-0.008), 0.6, {'time_offset', 'readout_time'}),
-        (3.0 * deviation(focal=SIGMA[FOCAL]), 0.0, set()),
+        (deviation(time_offset=0.01), 0.95, {'time_offset'}),
+        (deviation(time_offset=0.01, readout_time=-0.008), 0.6, {'time_offset', 'readout_time'}),
+        (3.0 * deviation(focal_log=SIGMA[FOCAL]), 0.0, set()),
     ],
 )  # not certain
 def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
@@ -585,7 +587,7 @@ def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
     'correlation, named', [(0.999, {'time_offset', 'readout_time'}), (0.8, {'time_offset'})]
 )
 def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named):
-    faults = assessed(calibration(deviation(offset=0.01), SIGMA, correlation)).faults
+    faults = assessed(calibration(deviation(time_offset=0.01), SIGMA, correlation)).faults
     assert {fault.code for fault in faults} == named
     assert all(
         ('time_offset or readout_time' in text_of(fault).fix) is (len(named) > 1)
@@ -595,8 +597,8 @@ def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named
 
 def test_the_error_that_linearisation_leaves_is_in_the_sigma():
     """And, in the published one, that of matches which were selected with the wrong value."""
-    c = deviation(offset=0.02)
-    estimated = replace(calibration(c, SIGMA), about=deviation(offset=0.014))
+    c = deviation(time_offset=0.02)
+    estimated = replace(calibration(c, SIGMA), about=deviation(time_offset=0.014))
     (found,) = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
     assert found.sigma[OFFSET] == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
     (fault,) = assessed(estimated).faults
@@ -606,17 +608,17 @@ def test_the_error_that_linearisation_leaves_is_in_the_sigma():
 @pytest.mark.parametrize(('size', 'likely'), [(1.5, 0.0), (3.0, 3.0)])
 def test_times_that_are_likely_to_be_off_are_linearised_there(size, likely):
     """Before they are certain; another parameter is not."""
-    c = deviation(offset=size * SIGMA[OFFSET], focal=3.9 * SIGMA[FOCAL])
+    c = deviation(time_offset=size * SIGMA[OFFSET], focal_log=3.9 * SIGMA[FOCAL])
     np.testing.assert_allclose(
         assessment.likely(calibration(c, SIGMA), CONFIGURED),
-        deviation(offset=likely * SIGMA[OFFSET]),
+        deviation(time_offset=likely * SIGMA[OFFSET]),
         rtol=0.01,
     )
 
 
 def test_configured_sigmas_bound_what_a_deviation_may_explain():
     """An offset within three of its sigmas is consistent, and explains what the readout seems."""
-    estimated = calibration(deviation(offset=0.01), SIGMA, 0.99)
+    estimated = calibration(deviation(time_offset=0.01), SIGMA, 0.99)
     known = replace(CONFIGURED, sigmas=np.where(np.arange(DEVIATIONS) == OFFSET, 0.005, 0.0))
     assert {fault.code for fault in assessed(estimated).faults} == {'time_offset'}
     assert not assessed(estimated, configured=known).faults
@@ -643,13 +645,13 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
     given = [0, 1, 2, OFFSET, READOUT, FOCAL, 10]
     np.testing.assert_allclose(doubt[given], small[given])
     # Of seven quantities two are not known: the odds are 2 to 7 that one of them is off.
-    assert doubt[SCALE] == pytest.approx(math.sqrt(2 / 9) * recursion.PRIOR_SIGMA[SCALE])
+    assert doubt[SCALE] == pytest.approx(math.sqrt(2 / 9) * LIVE.sigmas[SCALE])
 
 
 @pytest.mark.parametrize('size, row', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])
 def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
     """A remark, no finding of its own."""
-    (fault,) = assessed(calibration(deviation(offset=size), SIGMA)).faults
+    (fault,) = assessed(calibration(deviation(time_offset=size), SIGMA)).faults
     assert fault.code == 'time_offset'
     assert ('stamp_row' in text_of(fault).fix) is bool(row)
     assert not row or f'(stamp_row: {row} is equivalent)' in text_of(fault).fix
@@ -659,7 +661,7 @@ def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
     'size, state', [(0.0, 'ok'), (2.5e-3, 'ok'), (0.01, 'suspect'), (0.03, 'wrong')]
 )
 def test_the_state_follows_the_shift_of_the_pose(size, state):
-    health = assessed(calibration(deviation(offset=size), SIGMA))
+    health = assessed(calibration(deviation(time_offset=size), SIGMA))
     assert health.state is FindingState(state)
     (finding,) = (one for one in health.findings if one.code == 'time_offset')
     assert (finding.active, finding.estimate) == (
@@ -674,16 +676,16 @@ def test_the_state_follows_the_shift_of_the_pose(size, state):
 @pytest.mark.parametrize(
     'quantity, size, on, offered',
     [
-        ('offset', -0.03, False, True),
-        ('offset', -0.03, True, False),
-        ('offset', -0.06, False, False),
-        ('readout', 0.008, False, True),
-        ('readout', 0.008, True, False),
-        ('readout', 0.02, False, False),
+        ('time_offset', -0.03, False, True),
+        ('time_offset', -0.03, True, False),
+        ('time_offset', -0.06, False, False),
+        ('readout_time', 0.008, False, True),
+        ('readout_time', 0.008, True, False),
+        ('readout_time', 0.02, False, False),
     ],
 )
 def test_tracking_is_suggested_if_it_is_off_and_reaches_the_estimate(quantity, size, on, offered):
-    tracking = {'offset': 'track_time_offset', 'readout': 'track_readout_time'}[quantity]
+    tracking = f'track_{quantity}'
     fault = assessed(
         calibration(deviation(**{quantity: size}), SIGMA),
         assessment.Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
@@ -696,7 +698,7 @@ def test_messages_have_no_negative_zero():
     configured = replace(
         CONFIGURED, sensor=sensor(time_offset=0.0), gyro_bias=np.array([0.0, -1e-7, 0.0])
     )
-    health = assessed(calibration(deviation(offset=-1e-6), SIGMA), configured=configured)
+    health = assessed(calibration(deviation(time_offset=-1e-6), SIGMA), configured=configured)
     assert health.state is FindingState.OK
     assert not re.search(r'-0\.0*(\D|$)', one_line(health))
 
@@ -704,7 +706,7 @@ def test_messages_have_no_negative_zero():
 def test_gross_errors_leave_the_other_quantities_unknown():
     turned = rotations(Rotation.from_rotvec([1.5, 0.0, 0.0]).as_matrix()).compared()
     health = assessment.assess(
-        calibration(deviation(offset=0.03), SIGMA),
+        calibration(deviation(time_offset=0.03), SIGMA),
         [],
         assessment.gross_errors(turned, 0.0, CONFIGURED),
         CONFIGURED,
@@ -839,11 +841,11 @@ def test_the_readout_is_applied_as_far_as_frames_cover_it(configured, estimated,
 def test_tracked_values_are_those_of_the_parameters(direction, sign):
     """The offset is that of the middle row, with the active readout time: 2 ms more."""
     camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
-    active = deviation(readout=sign * 0.002)
+    active = deviation(readout_time=sign * 0.002)
     configured = assessment.Configured(
         sensor(readout_direction=direction), camera, np.full(3, 0.1), SIGMA, active
     )
-    c = deviation(offset=0.004, readout=sign * 0.006)
+    c = deviation(time_offset=0.004, readout_time=sign * 0.006)
     c[BIAS] = 0.01, 0.02, 0.03
     estimated = Tracked.of(calibration(c, SIGMA), configured)
     share = 0.5 * 479 / 480  # the stamped row is row 0
@@ -1089,7 +1091,7 @@ def estimated_pairs(c, count):
 
 
 @pytest.mark.parametrize(
-    'c', [deviation(focal=-0.03), deviation(readout=0.004)], ids=['focal', 'readout']
+    'c', [deviation(focal_log=-0.03), deviation(readout_time=0.004)], ids=['focal', 'readout']
 )
 def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
     """From the first pair on, with the configured rotation of the gyro, and without a fault."""

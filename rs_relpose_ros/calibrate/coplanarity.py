@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from rs_relpose_ros.core.deviations import OFFLINE, slices
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
@@ -120,27 +121,31 @@ def _evaluated(path: GyroPath, at: Array) -> Array:
 
 # -- Data and unknowns ----------------------------------------------------------------------------
 
-# Parameters of the calibration, in this order: readout time [s], offset of the middle row [s],
-# slope of the offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s]; of the
-# lens, beyond the assumed camera: logarithm of the focal length, first coefficient of the
-# distortion, principal point (2) [px]; square of the exposure beyond the assumed one [s^2].
-READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL, RADIAL, CENTER, EXPOSURE = (
-    0,
-    1,
-    2,
-    3,
-    6,
-    9,
-    10,
-    11,
-    13,
-)
-GLOBAL = 14
+# Places of the parameters of the calibration, which are values of `OFFLINE` of `core.deviations`;
+# entries with more than one value have slices. The rotation vector `ROTATION` acts on the left of
+# R_imu_cam; the lens is beyond the assumed camera.
+READOUT = OFFLINE.index('readout_time')
+OFFSET = OFFLINE.index('time_offset')
+SLOPE = OFFLINE.index('offset_per_interval')
+ROTATION = OFFLINE.part('axes')
+BIAS = OFFLINE.part('gyro_bias')
+FOCAL = OFFLINE.index('focal_log')
+RADIAL = OFFLINE.index('distortion')
+CENTER = OFFLINE.part('principal_point')
+EXPOSURE = OFFLINE.index('exposure_square')
+GLOBAL = OFFLINE.size
 LENS = slice(FOCAL, EXPOSURE)
+# Kernels need numbers in place of slices.
+_FIRST_AXIS = ROTATION.start
+_FIRST_BIAS = BIAS.start
 _OF_LENS = EXPOSURE - FOCAL
-# Unknowns of a pair: step of the direction in its tangent plane (2), bend (3), turn (3) [rad].
-DIRECTION, BEND, TURN = 14, 16, 19
-ALL = 22
+# Places of the unknowns of a pair, after the parameters: step of the direction in its tangent
+# plane (2), bend (3), turn (3) [rad].
+_OWN = slices({'direction': 2, 'bend': 3, 'turn': 3})
+DIRECTION = GLOBAL + _OWN['direction'].start
+BEND = GLOBAL + _OWN['bend'].start
+TURN = GLOBAL + _OWN['turn'].start
+ALL = GLOBAL + _OWN['turn'].stop
 LOCAL = ALL - GLOBAL
 # Residual [sigma] beyond which the Geman-McClure loss is nearly constant.
 ROBUST = 3.0
@@ -345,8 +350,8 @@ def _add_view(
     by_bias = rotated_back(sight.by_bias, by_turn)
     by_own_turn = rotated_back(Q_middle, by_turn)
     for i in range(3):
-        J[ROTATION + i] += by_rotation[i]
-        J[BIAS + i] -= by_bias[i]
+        J[_FIRST_AXIS + i] += by_rotation[i]
+        J[_FIRST_BIAS + i] -= by_bias[i]
         J[TURN + i] += share * by_own_turn[i]
 
 

@@ -97,7 +97,7 @@ def initial(
     """A calibration with the assumed lens, and the most likely directions of the pairs."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
     parameters[[READOUT, model.OFFSET]] = readout, offset
-    parameters[model.BIAS : model.FOCAL] = bias
+    parameters[model.BIAS] = bias
     # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
     return redirected(
         problem,
@@ -119,7 +119,7 @@ def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unk
         unknowns.R_imu_cam,
         p[model.OFFSET],
         p[READOUT],
-        p[model.BIAS : model.FOCAL],
+        p[model.BIAS],
         caution * float(np.median(unknowns.noise)),
     )
 
@@ -130,8 +130,8 @@ _STAY = np.zeros((1, LOCAL))
 def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
-    parameters[ROTATION : model.BIAS] = 0.0
-    rotation = Rotation.from_rotvec(step[ROTATION : model.BIAS]).as_matrix()
+    parameters[ROTATION] = 0.0
+    rotation = Rotation.from_rotvec(step[ROTATION]).as_matrix()
     # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
     direction = unknowns.own[:, :3] + np.einsum('pk,pki->pi', along, _tangents(unknowns))
@@ -284,9 +284,7 @@ def _medians(problem: Problem, values: Array) -> Array:
 def _path(problem: Problem, unknowns: Unknowns) -> model.GyroPath:
     parameters = unknowns.parameters
     estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
-    return model.GyroPath.integrated(
-        problem.gyro_times, estimated, parameters[model.BIAS : model.FOCAL]
-    )
+    return model.GyroPath.integrated(problem.gyro_times, estimated, parameters[model.BIAS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -378,7 +376,8 @@ def cost_curve(
     information = (
         final.information * (problem.begin[-1] / final.problem.begin[-1]) + np.diag(problem.prior)
     )[np.ix_(final.free, final.free)]
-    naive = float(np.linalg.inv(information)[0, 0])
+    place = int(np.count_nonzero(final.free[:READOUT]))
+    naive = float(np.linalg.inv(information)[place, place])
     return np.array([values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
 
 
@@ -584,9 +583,7 @@ def _disagreement(final: Fit) -> Array:
         for part in (first, ~first)
     )
     difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION : model.BIAS] = log_so3(
-        one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T
-    )
+    difference[ROTATION] = log_so3(one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
     variances = np.maximum(
         np.diag(one.covariance + other.covariance), 2.0 * np.diag(final.covariance)

@@ -375,10 +375,10 @@ class Observations:
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_ROTATION**2)
         prior, center = np.zeros(model.GLOBAL), np.zeros(model.GLOBAL)
         center[model.LENS] = -self.lens
-        prior[model.BIAS : model.BIAS + 3] = _BIAS_SIGMA**-2
+        prior[model.BIAS] = _BIAS_SIGMA**-2
         prior[model.SLOPE] = _SLOPE_SIGMA**-2
         prior[model.RADIAL] = _RADIAL_SIGMA**-2
-        prior[model.CENTER : model.CENTER + 2] = (_CENTER_SIGMA * self.camera.width) ** -2
+        prior[model.CENTER] = (_CENTER_SIGMA * self.camera.width) ** -2
         if self.exposure.square_sigma:
             prior[model.EXPOSURE] = self.exposure.square_sigma**-2
         blur_turns = cumulative_trapezoid(self.blur_rates, self.gyro_times, axis=0, initial=0.0)

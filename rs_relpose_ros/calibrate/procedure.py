@@ -139,9 +139,9 @@ def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tup
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
-    R, part = final.unknowns.R_imu_cam, slice(model.ROTATION, model.BIAS)
+    R, part = final.unknowns.R_imu_cam, model.ROTATION
     covariance = final.covariance.copy()
-    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS : model.FOCAL], R.T)
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS], R.T)
     if one_axis:  # about which the fit means nothing
         axis = R @ axis
         covariance[part] -= np.outer(axis, axis @ covariance[part])
@@ -284,7 +284,7 @@ _USELESS = 10.0
 # focal length (relative).
 _MOST = np.zeros(model.GLOBAL)
 _MOST[[model.READOUT, model.OFFSET, model.SLOPE, model.FOCAL]] = 1.5e-3, 3e-3, 0.5, 0.03
-_MOST[model.BIAS : model.FOCAL] = 0.01
+_MOST[model.BIAS] = 0.01
 # Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
 # tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
 # exposure also changes within one step of the interval; of the focal length (relative), as the
@@ -292,7 +292,7 @@ _MOST[model.BIAS : model.FOCAL] = 0.01
 _COMMON = np.zeros((2, model.GLOBAL))
 _COMMON[:, model.FOCAL] = 2e-4
 _COMMON[1, [model.READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
-_COMMON[1, model.ROTATION : model.BIAS], _COMMON[1, model.BIAS : model.FOCAL] = 1e-3, 2.5e-4
+_COMMON[1, model.ROTATION], _COMMON[1, model.BIAS] = 1e-3, 2.5e-4
 
 
 def evaluated(
@@ -318,14 +318,14 @@ def evaluated(
         )
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis, _ = data.excitation(parameters[model.BIAS : model.FOCAL], R_cam_imu)
+    rates, one_axis, _ = data.excitation(parameters[model.BIAS], R_cam_imu)
     sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
     if fit.move_of_poses(final, covariance) <= 1.0:
         wide = max(wide, config.unnoticed_tolerance)
     # Row 0 is read this share of the readout before the middle row.
     to_first, height = np.zeros(model.GLOBAL), data.camera.height
     to_first[[model.OFFSET, model.READOUT]] = 1.0, -0.5 * (height - 1) / height
-    part = slice(model.ROTATION, model.BIAS)  # about the axes of the camera
+    part = model.ROTATION  # about the axes of the camera
     rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
     axis_map = observations.nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
@@ -368,7 +368,7 @@ def evaluated(
             '' if axes_known else one_axis,
         ),
         axis_map=axis_map,
-        gyro_bias=tuple(map(of, range(model.BIAS, model.FOCAL))),
+        gyro_bias=tuple(of(k) for k in range(model.GLOBAL)[model.BIAS]),
         lens=lens,
         exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,

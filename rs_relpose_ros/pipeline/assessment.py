@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import Parameters, SensorConfig
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
@@ -30,7 +31,7 @@ from rs_relpose_ros.pipeline.findings import (
     Quantity,
     Why,
 )
-from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_SIGMA
+from rs_relpose_ros.pipeline.recursion import Calibration
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
 # Sigmas beyond which a deviation is certain, and those that suffice to linearise about it.
@@ -52,8 +53,8 @@ _OBSERVABLE_IN = 0.9
 _AS_CONFIGURED = 3.0
 # Error that linearisation leaves, 1 sigma as a share of the last step: on recordings with times
 # that are far off steps are 0.4 to 0.8 of the error, with other parameters 0.9.
-_REMAINS = np.full(findings.DEVIATIONS, 0.25)
-_REMAINS[[findings.OFFSET, findings.READOUT]] = 1.0
+_REMAINS = np.full(LIVE.size, 0.25)
+_REMAINS[LIVE.mask('time_offset', 'readout_time')] = 1.0
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
 # selected with the wrong value. About 0.08 on recordings.
 _SELECTED = 0.1
@@ -74,8 +75,8 @@ class Configured:
     sensor: SensorConfig
     camera: RollingShutterCamera
     gyro_bias: Array  # (3,) parameter [rad/s]
-    sigmas: Array  # (11,) configured, of the deviations; 0 if not known
-    active: Array  # (11,) deviations applied already: tracked parameters, bias at rest
+    sigmas: Array  # (K,) configured, of the deviations; 0 if not known
+    active: Array  # (K,) deviations applied already: tracked parameters, bias at rest
     center_sigma: float = 0.0  # [px] of the principal point, per axis
 
     @property
@@ -85,34 +86,35 @@ class Configured:
 
 
 def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
-    """1 sigma (11,) of the deviations by the parameters, 0 where they are not known.
+    """1 sigma (K,) of the deviations by the parameters, 0 where they are not known.
 
     `from_reference` [s]: interval between frames less that to which the time offset refers.
     """
-    sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(findings.DEVIATIONS)
-    sigmas[findings.AXES] = sensor.axes_sigma
-    sigmas[findings.BIAS] = parameters.imu.gyro_bias_sigma
-    sigmas[findings.OFFSET] = math.hypot(
+    sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(LIVE.size)
+    sigmas[LIVE.part('axes')] = sensor.axes_sigma
+    sigmas[LIVE.part('gyro_bias')] = parameters.imu.gyro_bias_sigma
+    sigmas[LIVE.index('time_offset')] = math.hypot(
         sensor.time_offset_sigma, (from_reference * sensor.time_offset_per_interval_sigma)
     )
-    sigmas[findings.READOUT] = sensor.readout_time_sigma
-    sigmas[[findings.FOCAL, findings.DISTORTION]] = lens.focal_length_sigma, lens.distortion_sigma
+    sigmas[LIVE.index('readout_time')] = sensor.readout_time_sigma
+    sigmas[LIVE.index('focal_log')] = lens.focal_length_sigma
+    sigmas[LIVE.index('distortion')] = lens.distortion_sigma
     return sigmas
 
 
 class Effect(NamedTuple):
     """Shift of a pair's pose by deviations, or of its rotation alone if it has no translation."""
 
-    shift: Array  # (5 or 3, 11) in sigmas of a correctly configured pose
-    claimed_shift: Array  # (6 or 3, 11) in published sigmas, which may include the disagreement
+    shift: Array  # (5 or 3, K) in sigmas of a correctly configured pose
+    claimed_shift: Array  # (6 or 3, K) in published sigmas, which may include the disagreement
 
 
 class Inconsistency(NamedTuple):
     """A quantity whose deviation is consistent with the pairs."""
 
     quantity: Quantity
-    deviation: Array  # (11,) from the active values; of this quantity alone
-    sigma: Array  # (11,)
+    deviation: Array  # (K,) from the active values; of this quantity alone
+    sigma: Array  # (K,)
     certainty: float  # in sigmas
     # Of the pose, Mahalanobis: in sigmas of a correctly configured one, of the pairs that it
     # moves most, and in published sigmas, in the median.
@@ -131,7 +133,7 @@ def find_inconsistencies(
     """
     found: list[tuple[Quantity, float]] = []
     alternative: Inconsistency | None = None
-    selected = np.zeros(findings.DEVIATIONS, dtype=bool)
+    selected = np.zeros(LIVE.size, dtype=bool)
     together = _solved(selected, estimated, configured)
     while len(found) < _MOST_QUANTITIES:
         (quantity, solution), (second, other) = _ranked(
@@ -169,13 +171,13 @@ def _ranked(
 
 
 def likely(estimated: Calibration, configured: Configured) -> Array:
-    """Deviation (11,) of the times that the pairs suggest, though not for certain; or zero.
+    """Deviation (K,) of the times that the pairs suggest, though not for certain; or zero.
 
     Far from an error of the times, pairs show little of it: they are linearised there, to see.
     """
     quantity, solution = _ranked(
         [one for one in findings.QUANTITIES if one.tracking],
-        np.zeros(findings.DEVIATIONS, dtype=bool),
+        np.zeros(LIVE.size, dtype=bool),
         estimated,
         configured,
     )[0]
@@ -185,7 +187,7 @@ def likely(estimated: Calibration, configured: Configured) -> Array:
 
 
 def undetermined(estimated: Calibration, configured: Configured) -> Array:
-    """Second moment (11, 11) of undetected deviations.
+    """Second moment (K, K) of undetected deviations.
 
     Those within configured sigmas exist for certain (the gyro bias is in the covariance of a pair
     already). Whether another quantity is off is not known: before the first pair the odds are
@@ -195,7 +197,7 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
     odds, known = 0.0, configured.sigmas > 0.0
-    known[findings.BIAS] = False
+    known[LIVE.part('gyro_bias')] = False
     estimated = replace(estimated, shared=1.0)
     for quantity in findings.QUANTITIES:
         part = quantity.part
@@ -205,34 +207,32 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
             gain = min(
                 float(solution.off[part] @ inverse(covariance) @ solution.off[part]), _LARGEST_GAIN
             )
-            of_prior = -2.0 * float(np.log(PRIOR_SIGMA[part]).sum())
+            of_prior = -2.0 * float(np.log(LIVE.sigmas[part]).sum())
             odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(
                 findings.QUANTITIES
             )
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
-    within[findings.BIAS] = within[:, findings.BIAS] = 0.0
+    within[LIVE.part('gyro_bias')] = within[:, LIVE.part('gyro_bias')] = 0.0
     return share * _solved(~known, estimated, configured).moment + (1.0 - share) * within
 
 
 def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
-    """Which deviations (11,) are those of a quantity."""
-    parts = np.zeros(findings.DEVIATIONS, dtype=bool)
-    parts[quantity.part] = True
-    return parts
+    """Which deviations (K,) are those of a quantity."""
+    return LIVE.mask(quantity.entry)
 
 
 class _Solution(NamedTuple):
     """Deviations that fit the pairs, if some are free."""
 
-    off: Array  # (11,) from the active values
-    covariance: Array  # (11, 11)
+    off: Array  # (K,) from the active values
+    covariance: Array  # (K, K)
     estimated: Calibration
-    active: Array  # (11,)
+    active: Array  # (K,)
 
     @property
     def by_pair(self) -> Array:
-        """(N, 11) part of each pair in the error of `off`, with common errors."""
+        """(N, K) part of each pair in the error of `off`, with common errors."""
         estimated = self.estimated
         scores = estimated.b - estimated.S @ (self.active + self.off)
         return (
@@ -243,14 +243,14 @@ class _Solution(NamedTuple):
 
     @property
     def sigma(self) -> Array:
-        """(11,) 1 sigma, at least as the parts of the pairs scatter."""
+        """(K,) 1 sigma, at least as the parts of the pairs scatter."""
         return np.asarray(
             np.sqrt(np.maximum(np.diag(self.covariance), (self.by_pair**2).sum(axis=0)))
         )
 
     @property
     def moment(self) -> Array:
-        """Second moment (11, 11) with these sigmas."""
+        """Second moment (K, K) with these sigmas."""
         widths = self.sigma / np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
         return self.covariance * np.outer(widths, widths) + np.outer(self.off, self.off)
 
@@ -271,9 +271,9 @@ class _Solution(NamedTuple):
 
 
 def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
-    """Deviations, those `free` (11,) within their wide prior, others within configured sigmas."""
-    sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
-    if free[findings.DISTORTION]:
+    """Deviations, those `free` (K,) within their wide prior, others within configured sigmas."""
+    sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
+    if free[LIVE.index('distortion')]:
         factors = estimated.if_distorted
         estimated = replace(
             estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
@@ -409,12 +409,12 @@ def _tracking(quantity: Quantity, estimated: float, configured: Configured) -> d
 
 def _equivalent_row(one: Inconsistency, configured: Configured) -> dict[str, Any]:
     """Another stamped row that is equivalent to the deviation of the time offset."""
-    camera, sigma = configured.camera, one.sigma[findings.OFFSET]
+    camera, sigma = configured.camera, one.sigma[LIVE.index('time_offset')]
     for row in REFERENCE_ROWS:
         index = replace(camera, reference_row=row).reference_row_index
         offset = camera.line_delay * (camera.reference_row_index - index)
         if row != camera.reference_row and (
-            abs(one.deviation[findings.OFFSET] - offset) < 2.0 * sigma
+            abs(one.deviation[LIVE.index('time_offset')] - offset) < 2.0 * sigma
         ):
             return {'stamp_row': row}
     return {}
@@ -437,9 +437,9 @@ def _values(
     evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=len(calibration.b))
     values: dict[Code, ArrayLike] = {  # active ones, in the unit of the quantity
         Code.AXES: 0.0,
-        Code.TIME_OFFSET: sensor.time_offset + float(configured.active[findings.OFFSET]),
+        Code.TIME_OFFSET: sensor.time_offset + float(configured.active[LIVE.index('time_offset')]),
         Code.READOUT_TIME: camera.readout_time,
-        Code.GYRO_BIAS: configured.gyro_bias + configured.active[findings.BIAS],
+        Code.GYRO_BIAS: configured.gyro_bias + configured.active[LIVE.part('gyro_bias')],
         Code.GYRO_SCALE: 1.0,
         Code.FOCAL_LENGTH: camera.fx,
         Code.DISTORTION: (*camera.distortion, 0.0)[0],

@@ -2,16 +2,7 @@
 
 A finding has codes and numbers; `findings_text` makes its text where it leaves the process.
 
-The vector ``c`` (11,) of small deviations, true minus configured, has these parts:
-
-- `AXES` [rad]: ``R_true = Exp(c) R_cam_imu``, in the camera frame;
-- `OFFSET` [s]: of ``time_offset``, of the stamped row;
-- `READOUT` [s]: of the signed readout time, negative if row 0 is read last; the stamped row
-  keeps its time;
-- `BIAS` [rad/s]: of the gyro, in the IMU frame;
-- `SCALE`: of the gyro, ``w_true = (1 + c) w``;
-- `FOCAL`: of the inverse focal length, ``f_true = f / (1 + c)``;
-- `DISTORTION`: of the first coefficient of the lens.
+Deviations are values of the selection `LIVE` of `core.deviations`.
 """
 
 from collections.abc import Mapping
@@ -23,14 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-AXES = slice(0, 3)
-OFFSET = 3
-READOUT = 4
-BIAS = slice(5, 8)
-SCALE = 8
-FOCAL = 9
-DISTORTION = 10
-DEVIATIONS = 11
+from rs_relpose_ros.core.deviations import LIVE
 
 # Largest deviations [s] that tracking applies.
 LARGEST_OFFSET, LARGEST_READOUT = 0.05, 0.01
@@ -226,11 +210,16 @@ class Quantity(NamedTuple):
     """A parameter of camera or IMU that images and gyro determine."""
 
     code: Code
-    part: slice  # of the deviations
+    entry: str  # of the deviations `LIVE`
     observable: float  # largest sigma of an observable deviation
     unit: str  # of a finding; deviations are in rad instead of deg, relative instead of px
     tracking: str = ''  # parameter that has it tracked
     reach: float = 0.0  # largest deviation that tracking applies
+
+    @property
+    def part(self) -> slice:
+        """Places of its deviations in a vector of `LIVE`."""
+        return LIVE.part(self.entry)
 
     def unknown(self, why: Why, parent: Code | None = None) -> Finding:
         """A finding without values."""
@@ -246,26 +235,12 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = (
-    Quantity(Code.AXES, AXES, math.radians(1.0), 'deg'),
-    Quantity(
-        Code.TIME_OFFSET,
-        slice(OFFSET, OFFSET + 1),
-        4e-3,
-        's',
-        'track_time_offset',
-        LARGEST_OFFSET,
-    ),
-    Quantity(
-        Code.READOUT_TIME,
-        slice(READOUT, READOUT + 1),
-        5e-3,
-        's',
-        'track_readout_time',
-        LARGEST_READOUT,
-    ),
-    Quantity(Code.GYRO_BIAS, BIAS, 0.01, 'rad/s'),
-    Quantity(Code.GYRO_SCALE, slice(SCALE, SCALE + 1), 0.03, ''),
-    Quantity(Code.FOCAL_LENGTH, slice(FOCAL, FOCAL + 1), 0.04, 'px'),
-    Quantity(Code.DISTORTION, slice(DISTORTION, DISTORTION + 1), 0.05, ''),
+    Quantity(Code.AXES, 'axes', math.radians(1.0), 'deg'),
+    Quantity(Code.TIME_OFFSET, 'time_offset', 4e-3, 's', 'track_time_offset', LARGEST_OFFSET),
+    Quantity(Code.READOUT_TIME, 'readout_time', 5e-3, 's', 'track_readout_time', LARGEST_READOUT),
+    Quantity(Code.GYRO_BIAS, 'gyro_bias', 0.01, 'rad/s'),
+    Quantity(Code.GYRO_SCALE, 'gyro_scale', 0.03, ''),
+    Quantity(Code.FOCAL_LENGTH, 'focal_log', 0.04, 'px'),
+    Quantity(Code.DISTORTION, 'distortion', 0.05, ''),
 )
 BY_CODE = {quantity.code: quantity for quantity in QUANTITIES}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import timing
 from rs_relpose_ros.geometry.camera import Intrinsics
@@ -23,7 +24,7 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import Sensor, to_nanoseconds
 from rs_relpose_ros.pipeline.assessment import Configured
-from rs_relpose_ros.pipeline.findings import Assessment, DEVIATIONS
+from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.monitor import ConsistencyMonitor
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, Pipeline, Processor
@@ -318,8 +319,8 @@ class RotationWatch(Processor[None]):
                 parameters.sensor,
                 camera,
                 np.array(parameters.imu.gyro_bias),
-                np.zeros(DEVIATIONS),
-                np.zeros(DEVIATIONS),
+                np.zeros(LIVE.size),
+                np.zeros(LIVE.size),
             ),
         )
         self._monitor.assess()

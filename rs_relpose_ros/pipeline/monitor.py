@@ -10,20 +10,19 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.config.settings import SensorConfig
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, findings_text, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
-from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, Finding, OFFSET, READOUT
+from rs_relpose_ros.pipeline.findings import Assessment, Finding
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
 
 # Frames by which clocks are compared, and latest pairs whose shift by a deviation is evaluated.
 _ARRIVALS, _EFFECTS = 20, 30
-# Largest deviations about which a pair is linearised: lens and readout must stay possible.
-_LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
 # Pairs whose agreement is remembered, pairs as which the prior counts (covariances are right),
 # and the largest chi-square of a pair, per degree of freedom.
 _REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
@@ -44,7 +43,7 @@ class ConsistencyMonitor:
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.latest: recursion.PairInformation | None = None  # of the last pair
         self._inconsistent: list[Inconsistency] = []
-        self._likely = np.zeros(DEVIATIONS)  # about which pairs are linearised
+        self._likely = np.zeros(LIVE.size)  # about which pairs are linearised
         self._undetermined: Array | None = None  # by the pairs before
         self._gross: tuple[Finding, ...] = ()
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
@@ -81,7 +80,7 @@ class ConsistencyMonitor:
                 stamp_ns,
                 data,
                 configured.active,
-                np.asarray(configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)),
+                np.asarray(configured.active + np.clip(self._likely, -LIVE.largest, LIVE.largest)),
             )
             if information is None:
                 return pose
@@ -149,8 +148,8 @@ class ConsistencyMonitor:
             self.health = Assessment((*self.health.findings, finding))
 
     def _deviation(self) -> Array:
-        """(11,) from the active values, of all inconsistent quantities."""
-        return sum((one.deviation for one in self._inconsistent), np.zeros(DEVIATIONS))
+        """(K,) from the active values, of all inconsistent quantities."""
+        return sum((one.deviation for one in self._inconsistent), np.zeros(LIVE.size))
 
 
 def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
@@ -264,18 +263,22 @@ class Tracked:
     @classmethod
     def of(cls, estimated: Calibration, configured: Configured) -> Tracked:
         """Configured plus estimated values; the offset is that of the middle row."""
-        along = np.zeros(len(estimated.c))
-        along[OFFSET], along[READOUT] = 1.0, recursion.middle_share(configured.camera)
-        offset = configured.sensor.time_offset + float(along @ estimated.c)
+        bias = LIVE.part('gyro_bias')
+        offset = LIVE.index('time_offset')
+        readout = LIVE.index('readout_time')
+        along = np.zeros(LIVE.size)
+        along[offset] = 1.0
+        along[readout] = recursion.middle_share(configured.camera)
+        of_middle = configured.sensor.time_offset + float(along @ estimated.c)
         signed = configured.camera.line_delay * configured.camera.height  # active
-        readout = signed - configured.active[READOUT] + estimated.c[READOUT]
+        now = signed - configured.active[readout] + estimated.c[readout]
         return cls(
-            configured.gyro_bias + estimated.c[BIAS],
-            estimated.sigma[BIAS],
-            offset - along[READOUT] * float(configured.active[READOUT]),
+            configured.gyro_bias + estimated.c[bias],
+            estimated.sigma[bias],
+            of_middle - along[readout] * float(configured.active[readout]),
             math.sqrt(float(along @ estimated.covariance @ along)),
-            float(readout) * configured.direction,
-            float(estimated.sigma[READOUT]),
+            float(now) * configured.direction,
+            float(estimated.sigma[readout]),
             len(estimated.b),
         )
 

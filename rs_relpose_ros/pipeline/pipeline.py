@@ -11,6 +11,7 @@ from typing import Any, Generic
 import numpy as np
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
 from rs_relpose_ros.estimator.pair_problem import PairProblem
@@ -366,12 +367,14 @@ class Pipeline(Processor[PairResult]):
             sensor.camera,
             bias,
             configured_sigmas(parameters, from_reference),
-            np.zeros(findings.DEVIATIONS),
+            np.zeros(LIVE.size),
             parameters.intrinsics.principal_point_sigma,
         )
-        configured.active[findings.OFFSET] = applied_offset_ns / NANOSECONDS
-        configured.active[findings.READOUT] = configured.direction * self._readout
-        configured.active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ since.bias - bias
+        configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
+        configured.active[LIVE.index('readout_time')] = configured.direction * self._readout
+        configured.active[LIVE.part('gyro_bias')] = (
+            parameters.sensor.R_cam_imu.T @ since.bias - bias
+        )
         return configured
 
     def _estimated(self, problem: PairProblem, stamp_ns: int) -> RelativePose:

@@ -1,7 +1,7 @@
 """Recursive calibration from frame pairs, the unknowns of each pair eliminated.
 
-Names are those of the equations in docs/health.md, "Recursive calibration"; the deviations c are
-those of `findings`.
+Names are those of the equations in docs/health.md, "Recursive calibration". The deviations c (K,)
+are values of the selection `LIVE` of `core.deviations`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator import priors
@@ -31,8 +32,6 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.integration import ImuSlice, RotationSensitivity
 from rs_relpose_ros.jit import kernel
-from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import AXES, BIAS, DEVIATIONS, FOCAL, OFFSET, READOUT
 
 # Sigma of the velocities about the mean one [baselines per second].
 _VELOCITY_SIGMA = 1.0
@@ -49,6 +48,13 @@ _STEP = 1e-5
 _LEAST_SPAN = 1e-4
 # Steps of a new fit of a pair.
 _NEW_STEPS = 3
+# Places of single deviations in the vector c.
+_OFFSET = LIVE.index('time_offset')
+_READOUT = LIVE.index('readout_time')
+_SCALE = LIVE.index('gyro_scale')
+_DISTORTION = LIVE.index('distortion')
+# Number of deviations before those of the lens, which come last.
+_LENS = LIVE.index('focal_log')
 # Of a state: rotation and direction of translation.
 _POSE = np.r_[THETA : THETA + 3, TANGENT : TANGENT + 2]
 
@@ -77,26 +83,26 @@ class PairData:
 class PairInformation:
     """Information of a pair on the calibration."""
 
-    S: Array  # (11, 11)
-    b: Array  # (11,)
+    S: Array  # (K, K)
+    b: Array  # (K,)
     if_distorted: float  # factor of both if the distortion is free: its residuals are no noise
-    pose_by_deviation: Array  # (6, 11) of (dt, dtheta) in camera 1, first order
+    pose_by_deviation: Array  # (6, K) of (dt, dtheta) in camera 1, first order
     pose_by_center: Array  # (6, 2) the same by the principal point [px]
-    # (5, 11) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
+    # (5, K) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
     images_against_gyro: Array  # (3,) [rad] Log of the rotation by images alone and R_gyro^T
 
 
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
-    """Information of a pair, linearised about the deviations `about` (11,).
+    """Information of a pair, linearised about the deviations `about` (K,).
 
-    Those applied already are `active` (11,): about others the pair is fitted again. None if there
+    Those applied already are `active` (K,): about others the pair is fitted again. None if there
     are too few matches, or if a fit far from the gyro's rotation diverges.
     """
     at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
     pair = replace(
         pair,
-        camera=_lens(pair.camera, *at[FOCAL:]),
+        camera=_lens(pair.camera, *at[_LENS:]),
         points1=pair.points1[::step],
         points2=pair.points2[::step],
     )
@@ -115,8 +121,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     if np.count_nonzero(keep) < PARAMETERS or rotation is None or information is None:
         return None
     D, turns, shares = _gyro(pair), *_by_rows(pair, problem, keep)
-    moved = (turns @ at[:FOCAL])[None], (shares * at[READOUT])[None]
-    rotation = so3.exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
+    moved = (turns @ at[:_LENS])[None], (shares * at[_READOUT])[None]
+    rotation = so3.exp_so3(D[:, : LIVE.size] @ at) @ rotation
     observations = _displaced(problem.observations[None, keep], *moved)[0]
     prior = priors.Priors(
         np.zeros(3),
@@ -133,8 +139,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     sigma = robust_scale(r, _LEAST_SIGMA, 0.0)
     weights = cauchy_weight((r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
-    delays = np.zeros((FOCAL, *shares.shape))
-    delays[READOUT] = _STEP * shares
+    delays = np.zeros((_LENS, *shares.shape))
+    delays[_READOUT] = _STEP * shares
     stepped = (
         _displaced(observations[None], _STEP * np.moveaxis(turns, -1, 0), delays),
         _displaced(_by_lens(pair, problem, keep), *moved),
@@ -153,10 +159,10 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
     b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
     # The principal point is not estimated: axes of the IMU have nearly the same effect.
-    S, b = 0.5 * (S + S.T)[:DEVIATIONS, :DEVIATIONS], b[:DEVIATIONS]
+    S, b = 0.5 * (S + S.T)[: LIVE.size, : LIVE.size], b[: LIVE.size]
     ratio, if_distorted = _common_noise(
         FitMatches(observations, weights, 1.0),
-        (J_c - J_x @ solved[:, :-1])[:, :DEVIATIONS],
+        (J_c - J_x @ solved[:, :-1])[:, : LIVE.size],
         r - J_x @ solved[:, -1],
         S,
     )
@@ -169,9 +175,9 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
         S,
         b + S @ about,
         ratio / if_distorted,
-        by_deviation[:, :DEVIATIONS],
-        by_deviation[:, DEVIATIONS:],
-        whitened[:, :DEVIATIONS],
+        by_deviation[:, : LIVE.size],
+        by_deviation[:, LIVE.size :],
+        whitened[:, : LIVE.size],
         np.asarray(theta - (inverse(H) @ gradient)[THETA : THETA + 3]),
     )
 
@@ -194,8 +200,8 @@ def _shifts(
     to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
     share, rates = middle_share(pair.camera), pair.segment.angular_velocities
     rate1, rate2 = to_middle @ rates[0], to_middle @ (pair.gyro_rotation @ rates[-1])
-    moved[TANGENT : TANGENT + 2, READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
-    moved[THETA : THETA + 3, READOUT] += share * (rate1 - rate2)
+    moved[TANGENT : TANGENT + 2, _READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
+    moved[THETA : THETA + 3, _READOUT] += share * (rate1 - rate2)
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     # In the axes of the stamped row.
     by_deviation = np.vstack(
@@ -210,18 +216,18 @@ def _shifts(
 def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, float]:
     """Variance of the score of the matches by image regions, over that by S; at least 1.
 
-    The second value is without residuals that a distortion explains. J (N, 11), r (N,):
-    derivatives and residuals of the fitted matches, S (11, 11): information of the pair.
+    The second value is without residuals that a distortion explains. J (N, K), r (N,):
+    derivatives and residuals of the fitted matches, S (K, K): information of the pair.
     """
-    scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
-    covariance = inverse(S * scale + np.eye(DEVIATIONS)) * scale
+    scale = np.outer(LIVE.sigmas, LIVE.sigmas)
+    covariance = inverse(S * scale + np.eye(LIVE.size)) * scale
     in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
-    along = J[:, findings.DISTORTION]
+    along = J[:, _DISTORTION]
     information = J.T * matches.weights @ J
     without = r - along * (
         (along * matches.weights)
         @ r
-        / (np.diag(information)[findings.DISTORTION] + PRIOR_SIGMA[findings.DISTORTION] ** -2.0)
+        / (np.diag(information)[_DISTORTION] + LIVE.sigmas[_DISTORTION] ** -2.0)
     )
     independent = float((covariance * information).sum())
 
@@ -257,7 +263,7 @@ def _state(
 
 @functools.lru_cache(maxsize=16)
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
-    """The camera with deviations of FOCAL and DISTORTION."""
+    """The camera with deviations of focal length and distortion."""
     if not (focal or distortion):
         return camera
     coefficients = list(camera.distortion) or [0.0] * 4
@@ -272,17 +278,17 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
 
 def _gyro(pair: PairData) -> Array:
     """Left derivative (3, 13) of the gyro's rotation between the middle rows, as of the rays."""
-    D, rates = np.zeros((3, DEVIATIONS + 2)), pair.segment.angular_velocities
-    D[:, AXES] = np.eye(3) - pair.gyro_rotation
-    D[:, OFFSET] = pair.gyro_rotation @ rates[-1] - rates[0]
-    D[:, READOUT] = middle_share(pair.camera) * D[:, OFFSET]
-    D[:, BIAS] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
-    D[:, findings.SCALE] = pair.gyro_sensitivity.by_scale
+    D, rates = np.zeros((3, LIVE.size + 2)), pair.segment.angular_velocities
+    D[:, LIVE.part('axes')] = np.eye(3) - pair.gyro_rotation
+    D[:, _OFFSET] = pair.gyro_rotation @ rates[-1] - rates[0]
+    D[:, _READOUT] = middle_share(pair.camera) * D[:, _OFFSET]
+    D[:, LIVE.part('gyro_bias')] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
+    D[:, _SCALE] = pair.gyro_sensitivity.by_scale
     return D
 
 
 def _by_lens(pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> Array:
-    """Observations (4, N, 20) with steps of FOCAL, DISTORTION, and the principal point [px].
+    """Observations (4, N, 20) with steps of focal length, distortion and the principal point [px].
 
     Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
     pixels would shrink with a longer focal length.
@@ -329,7 +335,7 @@ def _by_rows(
     """
     camera, n = pair.camera, np.count_nonzero(keep)
     half = 0.5 * (camera.row_time_span[1] - camera.row_time_span[0])
-    turns, shares = np.empty((n, 2, 3, FOCAL)), np.empty((n, 2))
+    turns, shares = np.empty((n, 2, 3, _LENS)), np.empty((n, 2))
     for k, (points, motion) in enumerate(
         ((pair.points1, problem.motion1), (pair.points2, problem.motion2))
     ):
@@ -341,11 +347,11 @@ def _by_rows(
             acceleration = (last + first) / half**2
         later = tau[:, None] * acceleration
         # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
-        turn[:, :, AXES] = -along * so3.skew(rate)
-        turn[:, :, OFFSET] = later
-        turn[:, :, READOUT] = shares[:, k, None] * rate + middle_share(camera) * later
-        turn[:, :, BIAS] = -along * pair.R_cam_imu
-        turn[:, :, findings.SCALE] = tau[:, None] * rate
+        turn[:, :, LIVE.part('axes')] = -along * so3.skew(rate)
+        turn[:, :, _OFFSET] = later
+        turn[:, :, _READOUT] = shares[:, k, None] * rate + middle_share(camera) * later
+        turn[:, :, LIVE.part('gyro_bias')] = -along * pair.R_cam_imu
+        turn[:, :, _SCALE] = tau[:, None] * rate
     return turns, shares
 
 
@@ -381,22 +387,22 @@ def middle_share(camera: RollingShutterCamera) -> float:
 
 # -- Other times of the rows -------------------------------------------------------------------
 
-_TIMES = [OFFSET, READOUT]
+_TIMES = [_OFFSET, _READOUT]
 
 
 def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairData | None:
-    """The pair with rows at the times of OFFSET and READOUT, not yet fitted.
+    """The pair with rows at the times of the deviations, not yet fitted.
 
     `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.
     """
-    signed = pair.camera.line_delay * pair.camera.height + float(deviations[READOUT])
+    signed = pair.camera.line_delay * pair.camera.height + float(deviations[_READOUT])
     camera = replace(
         pair.camera, readout_time=abs(signed), readout_direction='down' if signed >= 0.0 else 'up'
     )
     known, (begin, end) = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9, camera.row_time_span
     begin, end = begin - _LEAST_SPAN, end + _LEAST_SPAN
     first, second = (
-        seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k]) + float(deviations[OFFSET])
+        seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k]) + float(deviations[_OFFSET])
         for k in (0, -1)
     )
     if first + begin < 0.0 or second + end > known[-1]:
@@ -431,7 +437,7 @@ def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairDa
 
 
 def _far_in_time(deviations: Array) -> bool:
-    return float(np.linalg.norm((deviations / PRIOR_SIGMA)[_TIMES])) >= _NEAR
+    return float(np.linalg.norm((deviations / LIVE.sigmas)[_TIMES])) >= _NEAR
 
 
 # -- Sums over pairs ---------------------------------------------------------------------------
@@ -446,37 +452,35 @@ _AGAIN, _NEAR = 3, 0.02
 # a pair's sigma that is common to all pairs, and not reduced by averaging: blur, the tracker's
 # bias, a lens that the model does not fit.
 _FEW_PAIRS, _SHARED = 6, 0.15
-# Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
-PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """Estimated deviations from the configuration."""
 
-    c: Array  # (11,)
-    covariance: Array  # (11, 11)
-    S: Array  # (N, 11, 11) and (N, 11): of the pairs, without a prior
+    c: Array  # (K,)
+    covariance: Array  # (K, K)
+    S: Array  # (N, K, K) and (N, K): of the pairs, without a prior
     b: Array
     if_distorted: Array  # (N,) factors of these
-    about: Array  # (11,) about which they are linearised, in the mean by their information
+    about: Array  # (K,) about which they are linearised, in the mean by their information
     scatter: float  # variance of the scores over that by S: 1 where residuals are independent
     shared: float  # factor of the variances by errors that are common to all pairs
     widened: float  # and by the number of pairs
 
     @property
     def sigma(self) -> Array:
-        """(11,) 1 sigma."""
+        """(K,) 1 sigma."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 NOTHING_ESTIMATED = Calibration(
-    np.zeros(DEVIATIONS),
-    np.diag(PRIOR_SIGMA**2),
-    np.zeros((0, DEVIATIONS, DEVIATIONS)),
-    np.zeros((0, DEVIATIONS)),
+    np.zeros(LIVE.size),
+    np.diag(LIVE.sigmas**2),
+    np.zeros((0, LIVE.size, LIVE.size)),
+    np.zeros((0, LIVE.size)),
     np.zeros(0),
-    np.zeros(DEVIATIONS),
+    np.zeros(LIVE.size),
     1.0,
     1.0,
     1.0,
@@ -504,8 +508,8 @@ class _Entry(NamedTuple):
 
     stamp_ns: int
     data: PairData
-    active: Array  # (11,)
-    about: Array  # (11,)
+    active: Array  # (K,)
+    about: Array  # (K,)
     information: PairInformation
 
 
@@ -528,7 +532,7 @@ class Recursion:
         """Linearise the furthest pairs about the last one's deviations; whether there are any."""
         last = self._pairs[-1]
         apart = np.linalg.norm(
-            (np.array([pair.about for pair in self._pairs]) - last.about) / PRIOR_SIGMA, axis=1
+            (np.array([pair.about for pair in self._pairs]) - last.about) / LIVE.sigmas, axis=1
         )
         if len(apart) > 1 and _far_in_time(last.about - last.active):
             apart[-2] = math.inf  # now the gyro after it is known
@@ -559,8 +563,8 @@ class Recursion:
             for name in ('S', 'b', 'if_distorted')
         )
         # Scaled by the prior: the deviations have different units.
-        scale = PRIOR_SIGMA
-        hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
+        scale = LIVE.sigmas
+        hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(LIVE.size)
         covariance = inverse(hessian) * np.outer(scale, scale)
         c = covariance @ b.sum(axis=0)
         # Sandwich (White, Econometrica 1982), about the solution: scores about zero contain it.

@@ -1,0 +1,158 @@
+"""Deviations of camera, clocks and IMU from their configuration: one vector, in one order.
+
+A deviation is true minus configured. The live monitor, the calibration of recordings and the doubt
+of published poses use the entries of `ENTRIES` and take their indices from it. To add a deviation,
+add its row there, and its derivative where it enters: `core.rows` or `geometry.lens`.
+
+Nobody estimates all entries. A `Selection` is the basis of those that one estimator uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry import Array
+
+
+class Entry(NamedTuple):
+    """One deviation, with as many values as it has components."""
+
+    name: str
+    size: int
+    unit: str
+    # 1 sigma of each value before anything is measured, if the parameter may be wrong.
+    sigma: float
+    # Largest value about which a pair is linearised: times, lens and readout stay possible.
+    largest: float
+
+
+# [chosen: sigmas cover what users configure wrongly by accident, so that a wrong parameter is
+# within 3 sigmas; an axis that is exchanged is not a small deviation, and has checks of its own]
+ENTRIES = (
+    # R_true = Exp(c) R_cam_imu, in the axes of the camera.
+    Entry('axes', 3, 'rad', 0.2, 0.5),
+    # t_imu = t_image + time_offset, of the stamped row.
+    Entry('time_offset', 1, 's', 0.05, 0.06),
+    # Change of time_offset by the covariate of a frame, such as its interval.
+    Entry('offset_per_interval', 1, 's/s', 1.0, 2.0),
+    # From the first to the last row; negative if row 0 is read last.
+    Entry('readout_time', 1, 's', 0.03, 0.1),
+    Entry('gyro_bias', 3, 'rad/s', 0.1, 0.2),
+    # w_true = (1 + c) w for each axis of the IMU.
+    Entry('gyro_scale', 3, '', 0.2, 0.3),
+    # w_true = (I + M) w with M symmetric, zero on its diagonal: yz, xz, xy.
+    Entry('gyro_skew', 3, 'rad', 0.005, 0.02),
+    # The next four are those of `geometry.lens`, in its order. Both focal lengths by one factor.
+    Entry('focal_log', 1, '', 0.3, 0.45),
+    # fy / fx.
+    Entry('aspect', 1, '', 0.002, 0.01),
+    # Coefficients k1, k2, k3.
+    Entry('distortion', 3, '', 0.5, 0.6),
+    Entry('principal_point', 2, 'px', 10.0, 50.0),
+    # Square of the exposure time.
+    Entry('exposure_square', 1, 's^2', 1e-4, 1e-3),
+)
+
+
+def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Places of named parts of a vector, one after the other."""
+    places, start = {}, 0
+    for name, size in sizes.items():
+        places[name] = slice(start, start + size)
+        start += size
+    return places
+
+
+_PARTS = slices({entry.name: entry.size for entry in ENTRIES})
+# Number of values of the whole vector.
+N_DEVIATIONS = sum(entry.size for entry in ENTRIES)
+
+# Basis (3, 1) of one value that is common to the three components of an entry.
+COMMON = np.ones((3, 1))
+# Basis (3, 1) of the first of the three components alone.
+FIRST = np.eye(3)[:, :1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The deviations that an estimator uses, k values ``c``: all deviations are ``basis c``."""
+
+    basis: Array  # (N_DEVIATIONS, k)
+    parts: Mapping[str, slice]  # places of the entries in c
+    sigmas: Array  # (k,) before anything is measured
+    largest: Array  # (k,) about which a pair is linearised
+
+    @classmethod
+    def of(cls, *names: str, **bases: Array) -> Selection:
+        """Select entries by name, with all of their values or with a basis (size, m) each.
+
+        The order is the order of `ENTRIES`.
+        """
+        unknown = {*names, *bases} - _PARTS.keys()
+        if unknown:
+            raise ValueError(f'not the names of deviations: {sorted(unknown)}')
+        chosen = [entry for entry in ENTRIES if entry.name in {*names, *bases}]
+        own = [bases.get(entry.name, np.eye(entry.size)) for entry in chosen]
+        sizes = [basis.shape[1] for basis in own]
+        parts = slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
+        whole = np.zeros((N_DEVIATIONS, sum(sizes)))
+        for (name, part), basis in zip(parts.items(), own, strict=True):
+            whole[_PARTS[name], part] = basis
+        return cls(
+            whole,
+            parts,
+            np.repeat([entry.sigma for entry in chosen], sizes),
+            np.repeat([entry.largest for entry in chosen], sizes),
+        )
+
+    @property
+    def size(self) -> int:
+        """Number k of the values."""
+        return len(self.sigmas)
+
+    def part(self, name: str) -> slice:
+        """Places of the values of an entry."""
+        return self.parts[name]
+
+    def index(self, name: str) -> int:
+        """Place of the only value of an entry."""
+        part = self.parts[name]
+        if part.stop - part.start != 1:
+            raise ValueError(f'{name} has more than one value')
+        return int(part.start)
+
+    def mask(self, *names: str) -> NDArray[np.bool_]:
+        """Which of the values (k,) belong to these entries."""
+        chosen = np.zeros(self.size, dtype=bool)
+        for name in names:
+            chosen[self.parts[name]] = True
+        return chosen
+
+
+# Deviations that the live monitor estimates from the pairs of the last seconds.
+LIVE = Selection.of(
+    'axes',
+    'time_offset',
+    'readout_time',
+    'gyro_bias',
+    'focal_log',
+    gyro_scale=COMMON,
+    distortion=FIRST,
+)
+# Deviations that the calibration of a recording estimates.
+OFFLINE = Selection.of(
+    'axes',
+    'time_offset',
+    'offset_per_interval',
+    'readout_time',
+    'gyro_bias',
+    'focal_log',
+    'principal_point',
+    'exposure_square',
+    distortion=FIRST,
+)

@@ -1,0 +1,55 @@
+"""The vector of deviations: one order, and selections of it."""
+
+import numpy as np
+import pytest
+
+from rs_relpose_ros.core.deviations import (
+    ENTRIES,
+    LIVE,
+    N_DEVIATIONS,
+    OFFLINE,
+    Selection,
+    slices,
+)
+from rs_relpose_ros.geometry import lens
+
+
+def test_parts_of_a_vector_follow_one_another():
+    parts = slices({'a': 2, 'b': 1})
+    assert parts == {'a': slice(0, 2), 'b': slice(2, 3)}
+    assert sum(entry.size for entry in ENTRIES) == N_DEVIATIONS
+
+
+def test_a_selection_is_the_basis_of_its_values():
+    chosen = Selection.of('time_offset', gyro_scale=np.ones((3, 1)))
+    assert chosen.basis.shape == (N_DEVIATIONS, 2) and chosen.size == 2
+    everything = Selection.of(*(entry.name for entry in ENTRIES))
+    np.testing.assert_array_equal(everything.basis, np.eye(N_DEVIATIONS))
+    values = chosen.basis @ [0.01, 0.2]
+    assert values[everything.index('time_offset')] == 0.01
+    assert values[everything.part('gyro_scale')].tolist() == [0.2] * 3
+    assert np.count_nonzero(values) == 4
+    assert chosen.sigmas.tolist() == [0.05, 0.2]
+    assert chosen.mask('gyro_scale').tolist() == [False, True]
+
+
+def test_the_order_is_the_order_of_the_table_whoever_selects():
+    named = Selection.of('readout_time', 'axes')
+    assert named.part('axes') == slice(0, 3) and named.index('readout_time') == 3
+    for selection in (LIVE, OFFLINE):
+        order = [entry.name for entry in ENTRIES if entry.name in selection.parts]
+        assert list(selection.parts) == order
+
+
+def test_deviations_of_the_lens_have_its_order_and_follow_one_another():
+    names = [name for name, _ in lens.LENS_ENTRIES]
+    sizes = {entry.name: entry.size for entry in ENTRIES}
+    first = list(sizes).index(names[0])
+    assert list(sizes.items())[first : first + len(names)] == list(lens.LENS_ENTRIES)
+
+
+def test_names_that_are_none_and_places_of_several_values_are_refused():
+    with pytest.raises(ValueError, match='tilt'):
+        Selection.of('axes', 'tilt')
+    with pytest.raises(ValueError, match='axes'):
+        LIVE.index('axes')
