@@ -139,12 +139,14 @@ def test_a_good_bag_has_no_warning(tmp_path):
         *(quantity.code for quantity in QUANTITIES),
     } - {'gyro_bias'}
     assert {f.state for f in report.findings} == {FindingState.OK, FindingState.UNKNOWN}
-    assert findings['image rate'].measured['rate_hz'] == pytest.approx(10.0)
-    assert findings['imu rate'].measured['rate_hz'] == pytest.approx(200.0)
-    assert findings['gravity'].measured['mean_length_m_s2'] == pytest.approx(9.81, abs=0.2)
+    assert findings['image rate'].finding.evidence.measured['rate_hz'] == pytest.approx(10.0)
+    assert findings['imu rate'].finding.evidence.measured['rate_hz'] == pytest.approx(200.0)
+    assert findings['gravity'].finding.evidence.measured['mean_length_m_s2'] == pytest.approx(
+        9.81, abs=0.2
+    )
     # 0.02 s, 150 px and the median rate.
-    assert findings['rolling shutter'].measured['median_px'] == pytest.approx(
-        0.02 * 150.0 * findings['gyro'].measured['median_rad_s'], rel=0.1
+    assert findings['rolling shutter'].finding.evidence.measured['median_px'] == pytest.approx(
+        0.02 * 150.0 * findings['gyro'].finding.evidence.measured['median_rad_s'], rel=0.1
     )
 
 
@@ -328,7 +330,7 @@ def test_a_broken_recording_has_its_finding(case, tmp_path):
     if isinstance(expected, str):
         assert expected in found.fix
     else:
-        assert {key: found.measured[key] for key in expected} == expected
+        assert {key: found.finding.evidence.measured[key] for key in expected} == expected
     assert report.failed == any(f.state is F for f in report.findings)
     json.dumps(report.to_mapping(), allow_nan=False)
     assert len(report.lines(80)) > len(findings)
@@ -347,16 +349,19 @@ def test_intrinsics_by_parameters(changes, tmp_path):
     )
     findings, report = checked(broken(**changes).write(tmp_path / 'bag'), configured)
     assert not report.failed
-    assert findings['calibration'].measured['fx'] == 151.0
+    assert findings['calibration'].finding.evidence.measured['fx'] == 151.0
     assert 'camera_matrix' in findings['calibration'].message
     findings, _ = checked(broken(seconds=1.0).write(tmp_path / 'calibrated'), configured)
-    assert findings['calibration'].measured['fx'] == 151.0
+    assert findings['calibration'].finding.evidence.measured['fx'] == 151.0
 
 
 def test_missing_parameters_are_a_warning(tmp_path):
     findings, _ = checked(Small().write(tmp_path / 'bag'), Parameters())
     assert findings['parameters'].state is W
-    assert findings['parameters'].measured['missing'] == ['readout_time', 'quat_cam_imu_xyzw']
+    assert findings['parameters'].finding.evidence.measured['missing'] == [
+        'readout_time',
+        'quat_cam_imu_xyzw',
+    ]
     # They are not observable in this recording, either.
     assert [findings[name].state for name in ('axes', 'readout_time', 'rolling shutter')] == [
         FindingState.UNKNOWN
@@ -386,11 +391,11 @@ def test_the_bundled_bag_is_good(bundled_bag, parameters):
         assert finding.observable
         assert abs(finding.estimated - finding.configured) < 4.0 * finding.sigma
     assert findings['time_offset'].sigma < 2e-3
-    assert findings['parameters'].measured['nearest'] == (
+    assert findings['parameters'].finding.evidence.measured['nearest'] == (
         'cam x = -imu y, cam y = -imu z, cam z = +imu x'
     )
-    assert findings['pairs'].measured['poses'] > 20
-    assert findings['rolling shutter'].measured['p95_px'] > 1.0
+    assert findings['pairs'].finding.evidence.measured['poses'] > 20
+    assert findings['rolling shutter'].finding.evidence.measured['p95_px'] > 1.0
 
 
 @pytest.mark.parametrize(
@@ -412,7 +417,9 @@ def test_parameters_that_contradict_the_recording(
     if 'readout' in name:
         assert findings['time_offset'].state is FindingState.UNKNOWN
         # The rolling-shutter effect is that of the estimate.
-        assert findings['rolling shutter'].measured['readout_s'] == pytest.approx(0.03, abs=0.006)
+        assert findings['rolling shutter'].finding.evidence.measured['readout_s'] == pytest.approx(
+            0.03, abs=0.006
+        )
 
 
 def longer(message):
@@ -439,7 +446,9 @@ def test_missing_parameters_are_estimated(short_bag):
     readout = findings['readout_time']
     assert (readout.configured, readout.estimate) == (None, pytest.approx(0.03, abs=2e-3))
     assert abs(findings['time_offset'].estimated) < 3e-3
-    assert findings['rolling shutter'].measured['readout_s'] == pytest.approx(0.03, abs=2e-3)
+    assert findings['rolling shutter'].finding.evidence.measured['readout_s'] == pytest.approx(
+        0.03, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -652,10 +661,10 @@ def test_every_container(kind, offered, reliability, tmp_path):
             **offered,
         )
     )
-    assert findings['image rate'].measured['count'] == 10
-    assert findings['imu rate'].measured['rate_hz'] == pytest.approx(200.0)
-    assert findings['live transport'].measured['reliability'] == reliability
-    assert findings['imu rate'].measured['reliability'] == reliability
+    assert findings['image rate'].finding.evidence.measured['count'] == 10
+    assert findings['imu rate'].finding.evidence.measured['rate_hz'] == pytest.approx(200.0)
+    assert findings['live transport'].finding.evidence.measured['reliability'] == reliability
+    assert findings['imu rate'].finding.evidence.measured['reliability'] == reliability
 
 
 def test_command_line(tmp_path, capsys):

@@ -336,13 +336,10 @@ def test_unusable_calibration_is_refused(change, expected):
 def test_absent_sensors_are_none(types, change, gyro, force):
     stamp_ns = 1_700_000_000_123_456_789
     message = build.imu(types, stamp_ns, **change)
-    for size in range(8):  # all alignments of the numbers in its bytes
-        message.header.frame_id = 'x' * size
-        for msg in (message, build.serialized(message)):
-            for with_gyro in (True, False) if force else (True,):
-                assert incoming.imu_sample_from_message(msg, with_gyro=with_gyro) == ImuSample(
-                    stamp_ns, gyro if with_gyro else None, force
-                )
+    for with_gyro in (True, False) if force else (True,):
+        assert incoming.imu_sample_from_message(message, with_gyro=with_gyro) == ImuSample(
+            stamp_ns, gyro if with_gyro else None, force
+        )
 
 
 @pytest.mark.parametrize(
@@ -972,7 +969,7 @@ def test_messages_of_sensors(tmp_path):
                     (0.1, 0.2, 0.3),
                     (1.0, 2.0, 9.8),
                     bag.type,
-                    angular_velocity_covariance=4e-6 * np.eye(3),
+                    covariances={'angular_velocity': 4e-6 * np.eye(3)},
                 ),
                 outgoing.camera_info_message(STAMP_NS, 'cam', camera, None, bag.type),
             )

@@ -192,8 +192,10 @@ def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[
                 rate,
                 force,
                 bag.type,
-                angular_velocity_covariance=gyro_covariance,
-                linear_acceleration_covariance=accel_covariance,
+                covariances={
+                    'angular_velocity': gyro_covariance,
+                    'linear_acceleration': accel_covariance,
+                },
             ),
         )
 

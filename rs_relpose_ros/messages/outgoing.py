@@ -5,7 +5,7 @@ have the stamp of the current image.
 """
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 import sys
 from typing import Any, Literal, NamedTuple
@@ -28,43 +28,26 @@ from rs_relpose_ros.tracking.images import Pixels
 
 MessageTypes = Callable[[str], Any]
 
-_UINT32, _FLOAT32 = 6, 7  # sensor_msgs/PointField
-
-# Floats first: `point_cloud2.read_points_numpy` reads only fields of the type of the first.
-MATCH_DTYPE = np.dtype(
-    [
-        (name, '<f4')
-        for name in (
-            'u1',
-            'v1',
-            'u2',
-            'v2',
-            'tau1',
-            'tau2',
-            'x1',
-            'y1',
-            'z1',
-            'x2',
-            'y2',
-            'z2',
-            'x',
-            'y',
-            'z',
-            'u1_gs',
-            'v1_gs',
-            'u2_gs',
-            'v2_gs',
-        )
-    ]
-    + [('id', '<u4')]
+# Columns of ~/matches, in the order of `inlier_records`. Floats come first:
+# `point_cloud2.read_points_numpy` reads only fields of the type of the first.
+_FLOATS = (
+    *('u1', 'v1', 'u2', 'v2'),
+    *('tau1', 'tau2'),
+    *('x1', 'y1', 'z1', 'x2', 'y2', 'z2'),
+    *('x', 'y', 'z'),
+    *('u1_gs', 'v1_gs', 'u2_gs', 'v2_gs'),
 )
-# Name, offset and type of each, for sensor_msgs/PointField.
+MATCH_DTYPE = np.dtype([*((name, '<f4') for name in _FLOATS), ('id', '<u4')])
+# Numbers of the types in sensor_msgs/PointField.
+_POINT_FIELDS = {'<f4': 7, '<u4': 6}
+# Name, offset and type of each field, for sensor_msgs/PointField.
 MATCH_FIELDS = tuple(
-    (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
-    for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items()
+    (name, int(offset), _POINT_FIELDS[dtype.str])
+    for name, (dtype, offset, *_) in (MATCH_DTYPE.fields or {}).items()
 )
 
-# Queue length of a pair topic: three seconds at 30 Hz.
+# Queue length of a pair topic. A shorter one loses pairs while a subscriber is busy; a longer one
+# costs memory alone. [chosen: three seconds of pairs at 30 Hz; one second to a minute would do]
 PAIR_HISTORY = 100
 # Topics of a pair in the order of publication, and their types.
 PAIR_TOPICS = {
@@ -79,11 +62,14 @@ PAIR_TOPICS = {
 POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
 DEBUG_IMAGE = 'debug_image'
 
-# Of derotated images; the default of image_transport.
+# Quality of derotated JPEG images. Below it matching suffers, above it messages grow without use.
+# [chosen: the default of image_transport, so that both kinds of publishers send alike]
 _JPEG_QUALITY = 95
 # Integer fields of sensor_msgs/RegionOfInterest.
 _REGION = ('x_offset', 'y_offset', 'height', 'width')
-# Least eigenvalue of a published covariance of rank 5, relative to the largest, against rounding.
+# Least eigenvalue of a published covariance, relative to the largest one. The covariance of a
+# direction has rank 5; with an eigenvalue that rounding made negative it could not be inverted or
+# sampled. [chosen: above double rounding, 1e-15, and below each true variance, 1e-9]
 _LEAST_EIGENVALUE = 1e-14
 
 
@@ -251,9 +237,11 @@ def pair_parts(
             pose.angular_velocity2,
             None,
             types,
-            angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
             orientation=quat_xyzw(pose.R),
-            orientation_covariance=published_covariance(pose.covariance[3:, 3:]),
+            covariances={
+                'angular_velocity': published_covariance(pose.velocity_covariance[3:, 3:]),
+                'orientation': published_covariance(pose.covariance[3:, 3:]),
+            },
         )
     topics = ' '.join(parts)
     parts['pairs'] = lambda: _status_of_pair(result, topics, types)
@@ -302,27 +290,32 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     the landmark in the reference camera [baselines], global-shutter pixels at the stamped
     rows.
     """
-    inliers, found = result.pose.inliers, result.landmarks
+    inliers, found, matches = result.pose.inliers, result.landmarks, result.matches
     assert found is not None, 'only pairs with a pose have inliers to publish'
-    records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
-    records['id'] = result.matches.track_ids[inliers]
-    for names, values in (
-        ('u1 v1', result.matches.points1),
-        ('u2 v2', result.matches.points2),
-        ('tau1', result.matches.row_times[0][:, None]),
-        ('tau2', result.matches.row_times[1][:, None]),
-        ('x1 y1 z1', result.matches.rays[0]),
-        ('x2 y2 z2', result.matches.rays[1]),
-        ('x y z', found.points),
-        ('u1_gs v1_gs', found.pixels1),
-        ('u2_gs v2_gs', found.pixels2),
-    ):
-        for column, name in enumerate(names.split()):
-            records[name] = values[inliers, column]
+    table = np.column_stack(
+        [
+            matches.points1,
+            matches.points2,
+            *matches.row_times,
+            *matches.rays,
+            found.points,
+            found.pixels1,
+            found.pixels2,
+        ]
+    )[inliers]
+    records = np.empty(len(table), dtype=MATCH_DTYPE)
+    records['id'] = matches.track_ids[inliers]
+    for name, column in zip(_FLOATS, table.T, strict=True):
+        records[name] = column
     return records
 
 
 # -- messages of any kind --------------------------------------------------------------------
+
+
+_UNKNOWN_COVARIANCES: Mapping[str, Array] = {}
+# Covariance of a sensor that does not exist (REP-145).
+_ABSENT_COVARIANCE = np.diag([-1.0, 0.0, 0.0]).ravel()
 
 
 def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
@@ -385,32 +378,24 @@ def imu_message(
     linear_acceleration: ArrayLike | None,
     types: MessageTypes,
     *,
-    angular_velocity_covariance: Array | None = None,
-    linear_acceleration_covariance: Array | None = None,
     orientation: ArrayLike | None = None,
-    orientation_covariance: Array | None = None,
+    covariances: Mapping[str, Array] = _UNKNOWN_COVARIANCES,
 ) -> Any:
     """sensor_msgs/Imu (REP-145).
 
     Rates (3,) [rad/s] and specific force (3,) [m/s^2], +g up at rest, in the frame; None is an
-    absent measurement: the first element of its covariance is -1. Covariances have 9 elements;
-    None is unknown.
+    absent measurement: the first element of its covariance is -1. `covariances`: 9 elements by
+    the name of a measurement; others are unknown.
     """
     fields = {}
-    for name, kind, value, covariance in (
-        ('orientation', 'Quaternion', orientation, orientation_covariance),
-        ('angular_velocity', 'Vector3', angular_velocity, angular_velocity_covariance),
-        ('linear_acceleration', 'Vector3', linear_acceleration, linear_acceleration_covariance),
+    for name, kind, absent, value in (
+        ('orientation', 'Quaternion', (0.0, 0.0, 0.0, 1.0), orientation),
+        ('angular_velocity', 'Vector3', (0.0, 0.0, 0.0), angular_velocity),
+        ('linear_acceleration', 'Vector3', (0.0, 0.0, 0.0), linear_acceleration),
     ):
-        absent = (0.0, 0.0, 0.0, 1.0) if kind == 'Quaternion' else (0.0, 0.0, 0.0)
         fields[name] = geometry_message(kind, absent if value is None else value, types)
-        fields[f'{name}_covariance'] = (
-            np.diag([-1.0, 0.0, 0.0]).ravel()
-            if value is None
-            else np.zeros(9)
-            if covariance is None
-            else np.ravel(covariance)
-        )
+        covariance = np.ravel(covariances.get(name, np.zeros(9)))
+        fields[f'{name}_covariance'] = _ABSENT_COVARIANCE if value is None else covariance
     return types('sensor_msgs/msg/Imu')(header=header(stamp_ns, frame_id, types), **fields)
 
 
@@ -592,6 +577,7 @@ _BAR_WIDTH = 14
 _CAPTION_HEIGHT = 24
 _OUTLIER = (255, 255, 0)
 _WHITE = (255, 255, 255)
+_FONT_SCALE = 0.42
 # From the first row to the last one (216, 3).
 _COLORS = np.asarray(
     cv2.applyColorMap(np.arange(40, 256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0],
@@ -619,45 +605,31 @@ def draw_pair(result: PairResult) -> Color:
         inliers = np.zeros(len(points1), dtype=bool)
     colors = _COLORS[(points2[:, 1] / height * len(_COLORS)).astype(int)].tolist()
     # Pixel centres lie at integer coordinates.
-    ends = np.round(
-        ((np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5) * (1 << _SHIFT)
-    ).astype(int)
+    scaled = (np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5
+    ends = np.round(scaled * (1 << _SHIFT)).astype(int)
     for (start, end), inlier, color in zip(ends.tolist(), inliers, colors, strict=True):
         color = color if inlier else _OUTLIER
         cv2.line(canvas, start, end, color, 1, cv2.LINE_AA, _SHIFT)
         cv2.circle(canvas, end, 2 << _SHIFT, color, -1, cv2.LINE_AA, _SHIFT)
     if len(points2) and np.ptp(points2[:, 1]) >= 1.0:
         canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
-        times = np.polyval(
-            np.polyfit(points2[:, 1], result.matches.row_times[1], 1), (0, height - 1)
-        )
+        line = np.polyfit(points2[:, 1], result.matches.row_times[1], 1)
+        times = np.polyval(line, (0, height - 1))
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
-            cv2.putText(
-                canvas,
-                f'{round(1e3 * time, 1) + 0.0:.1f} ms',
-                (_BAR_WIDTH + 4, y),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.42,
-                _WHITE,
-                1,
-                cv2.LINE_AA,
-            )
+            _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y))
     pose = result.pose
-    model, residual = (
-        (f' {pose.diagnostics.model}', f', residual {pose.diagnostics.residual_rms:.2f} px')
-        if pose
-        else ('', '')
-    )
+    model = f' {pose.model}' if pose else ''
+    residual = f', residual {pose.residual_rms:.2f} px' if pose else ''
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
-    cv2.putText(
-        caption,
+    text = (
         f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
-        f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}',
-        (6, 16),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        0.42,
-        _WHITE,
-        1,
-        cv2.LINE_AA,
+        f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}'
     )
+    _write(caption, text, (6, 16))
     return np.concatenate([canvas, caption])
+
+
+def _write(canvas: Color, text: str, place: tuple[int, int]) -> None:
+    """Write a text in white; `place`: its lower left corner [px]."""
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(canvas, text, place, font, _FONT_SCALE, _WHITE, 1, cv2.LINE_AA)

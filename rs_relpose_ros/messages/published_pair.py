@@ -24,11 +24,20 @@ from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
 from rs_relpose_ros.pipeline.findings import Assessment
 
-# Largest deviation from 1 of the length of directions, quaternions and rays.
+# Largest deviation from 1 of the length of directions, quaternions and rays. Those of our node
+# have the rounding of float32; a larger bound would use a vector that is no direction.
+# [chosen: 1e-6 to 1e-2 would do]
 _UNIT_TOLERANCE = 1e-3
-# Most negative eigenvalue of an information by rounding, relative to the largest one; the largest
-# one of all: a sigma of 1e-7 rad.
-_LEAST_INFORMATION, _MOST_INFORMATION = 1e-6, 1e14
+# Most negative eigenvalue of an information, relative to its largest one. It may be negative by
+# rounding alone; a smaller bound would refuse messages of our own node, a larger one would pass an
+# indefinite matrix to a graph. [chosen: 1e-9, double rounding of 11 x 11, to 1e-3 would do]
+_LEAST_INFORMATION = 1e-6
+# Largest eigenvalue of an information: a sigma of 1e-7 rad. No camera is that accurate, so that a
+# larger value is a damaged message, which would dominate a graph. [chosen: 1e12 to 1e20 would do]
+_MOST_INFORMATION = 1e14
+# Largest speed [baselines/s, rad/s] of a message: above every camera, and its square is far from
+# an overflow. [chosen: 1e4 to 1e100 would do]
+_LARGEST_SPEED = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,41 +115,26 @@ class PairStatus:
         size = len(gradient)
         if size == 0:
             return None
-        row_times, xyzw, t, velocities, upper = (
-            self[f'image_{name}']
-            for name in ('row_s', 'rotation_xyzw', 'direction', 'velocities', 'information')
-        )
-        rows = np.triu_indices(size)
+        row_times, xyzw = self['image_row_s'], self['image_rotation_xyzw']
+        t, velocities = self['image_direction'], self['image_velocities']
+        upper = self['image_information']
         has_direction = len(t) == 3 and len(velocities) == 6 and _is_unit(t)
-        if not (
-            (size == ROTATION or (size == POSE and has_direction))
-            and len(upper) == len(rows[0])
-            and len(row_times) == 1
-            and abs(row_times[0]) < 1.0
-            and len(xyzw) == 4
-            and _is_unit(xyzw)
-        ):
+        has_size = size == ROTATION or (size == POSE and has_direction)
+        has_rotation = len(xyzw) == 4 and _is_unit(xyzw)
+        has_row = len(row_times) == 1 and abs(row_times[0]) < 1.0
+        rows = np.triu_indices(size)
+        if not (has_size and has_rotation and has_row and len(upper) == len(rows[0])):
             raise InputError(
                 'image_information of ~/pairs and the other keys image_* must be of '
                 f'{POSE} or {ROTATION} unknowns, got {size}'
             )
-        H = np.zeros((size, size))
-        H[rows] = H.T[rows] = upper
-        values = np.linalg.eigvalsh(H)
-        if (
-            not -_LEAST_INFORMATION * values[-1] <= values[0] <= values[-1]
-            or not 0.0 < values[-1] < _MOST_INFORMATION
-        ):
-            raise InputError(
-                'image_information of ~/pairs must be positive semidefinite, with '
-                f'eigenvalues below {_MOST_INFORMATION:g}, got {values[0]:.3g} to '
-                f'{values[-1]:.3g}: the pair is not used'
-            )
         if size == ROTATION:
             t, velocities = np.full(3, math.nan), np.full(6, math.nan)
-        return ImageInformation(
-            float(row_times[0]), Rotation.from_quat(xyzw).as_matrix(), t, velocities, H, gradient
-        )
+        H = np.zeros((size, size))
+        H[rows] = H.T[rows] = upper
+        _refuse_indefinite(H)
+        R = Rotation.from_quat(xyzw).as_matrix()
+        return ImageInformation(float(row_times[0]), R, t, velocities, H, gradient)
 
     def topics(self) -> set[str]:
         """Topics of the pair, ``~/pairs`` included."""
@@ -197,41 +191,13 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
             f'~/pairs lists {" ".join(sorted(topics))}, but there are {" ".join(sorted(stamps))}'
         )
     fields = {value.field: status[key] for key, value in PAIR_VALUES.items() if value.field}
+    fields |= _without_rotation()
     if 'relative_pose' in messages:
         if time_ns(messages['reference'].time_ref) != fields['reference_stamp_ns']:
             raise InputError('~/reference and ~/pairs must name the same reference keyframe')
-        pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
-        fields |= {
-            'R': _rotation('~/relative_pose', pose.pose.orientation),
-            't': _unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
-            'covariance': _covariance('~/relative_pose', pose.covariance, 6),
-            'linear_velocity': _velocity('the linear velocity of ~/velocity', twist.twist.linear),
-            'angular_velocity': _velocity(
-                'the angular velocity of ~/velocity', twist.twist.angular
-            ),
-            'velocity_covariance': _covariance('~/velocity', twist.covariance, 6),
-            'matches': match_records(messages['matches']),
-        }
-    else:
-        covariances = np.full((2, 6, 6), math.nan)
-        R, angular_velocity = np.full((3, 3), math.nan), np.full(3, math.nan)
-        if 'relative_rotation' in messages:
-            imu, topic = messages['relative_rotation'], '~/relative_rotation'
-            R = _rotation(topic, imu.orientation)
-            angular_velocity = _velocity(f'the angular velocity of {topic}', imu.angular_velocity)
-            covariances[:, 3:, 3:] = [
-                _covariance(topic, block, 3)
-                for block in (imu.orientation_covariance, imu.angular_velocity_covariance)
-            ]
-        fields |= {
-            'R': R,
-            't': np.full(3, math.nan),
-            'covariance': covariances[0],
-            'linear_velocity': np.full(3, math.nan),
-            'angular_velocity': angular_velocity,
-            'velocity_covariance': covariances[1],
-            'matches': np.empty(0, MATCH_DTYPE),
-        }
+        fields |= _of_pose(messages)
+    elif 'relative_rotation' in messages:
+        fields |= _of_rotation(messages['relative_rotation'])
     return PublishedPair(
         stamp_ns=stamps['pairs'],
         images=status.images(),
@@ -241,37 +207,100 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
     )
 
 
+def _without_rotation() -> dict[str, Any]:
+    """Fields of a pair without rotation and pose."""
+    return {
+        'R': np.full((3, 3), math.nan),
+        't': np.full(3, math.nan),
+        'covariance': np.full((6, 6), math.nan),
+        'linear_velocity': np.full(3, math.nan),
+        'angular_velocity': np.full(3, math.nan),
+        'velocity_covariance': np.full((6, 6), math.nan),
+        'matches': np.empty(0, MATCH_DTYPE),
+    }
+
+
+def _of_pose(messages: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a pair with a pose."""
+    pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
+    linear, angular = twist.twist.linear, twist.twist.angular
+    return {
+        'R': _rotation('~/relative_pose', pose.pose.orientation),
+        't': _unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
+        'covariance': _covariance('~/relative_pose', pose.covariance, 6),
+        'linear_velocity': _velocity('the linear velocity of ~/velocity', linear),
+        'angular_velocity': _velocity('the angular velocity of ~/velocity', angular),
+        'velocity_covariance': _covariance('~/velocity', twist.covariance, 6),
+        'matches': match_records(messages['matches']),
+    }
+
+
+def _of_rotation(imu: Any) -> dict[str, Any]:
+    """Fields of a pair whose rotation is known; the other parts of its covariances are NaN."""
+    topic = '~/relative_rotation'
+    covariance, velocity_covariance = np.full((2, 6, 6), math.nan)
+    covariance[3:, 3:] = _covariance(topic, imu.orientation_covariance, 3)
+    velocity_covariance[3:, 3:] = _covariance(topic, imu.angular_velocity_covariance, 3)
+    return {
+        'R': _rotation(topic, imu.orientation),
+        'covariance': covariance,
+        'angular_velocity': _velocity(f'the angular velocity of {topic}', imu.angular_velocity),
+        'velocity_covariance': velocity_covariance,
+    }
+
+
 def match_records(cloud: Any) -> NDArray[np.void]:
     """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory."""
+    names = [str(field.name)[:20] for field in cloud.fields[:20]]
     found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
-    wanted = [(name, offset, datatype, 1) for name, offset, datatype in outgoing.MATCH_FIELDS]
+    wanted = [(*field, 1) for field in outgoing.MATCH_FIELDS]
     if found != wanted or int(cloud.point_step) != MATCH_DTYPE.itemsize or cloud.is_bigendian:
-        names = ' '.join(name[:20] for name, *_ in found[:20])
         raise InputError(
             f'~/matches must have the fields {" ".join(MATCH_DTYPE.names or ())}, little endian, '
-            f'{MATCH_DTYPE.itemsize} bytes a point; got {names or "none"}, '
+            f'{MATCH_DTYPE.itemsize} bytes a point; got {" ".join(names) or "none"}, '
             f'{"big" if cloud.is_bigendian else "little"} endian, {int(cloud.point_step)} bytes'
         )
     data = np.frombuffer(cloud.data, dtype=np.uint8)
-    count = int(cloud.width) * int(cloud.height)
-    if len(data) != count * MATCH_DTYPE.itemsize:
+    size = int(cloud.width) * int(cloud.height) * MATCH_DTYPE.itemsize
+    if len(data) != size:
         raise InputError(
             f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
-            f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}'
+            f'{int(cloud.height)} points need {size}'
         )
     records = data.view(MATCH_DTYPE)
+    _refuse_damaged(records)
+    return records
+
+
+def _refuse_damaged(records: NDArray[np.void]) -> None:
+    """InputError if matches are not finite, or their rays no directions."""
     # A match without a landmark has NaN in x, y and z.
     far = np.isnan(records['x']) & np.isnan(records['y']) & np.isnan(records['z'])
-    if not all(
-        (np.isfinite(records[name]) | (far & (name in ('x', 'y', 'z')))).all()
-        for name in MATCH_DTYPE.names or ()
-    ):
-        raise InputError('~/matches must be finite')
+    for name in MATCH_DTYPE.names or ():
+        finite = np.isfinite(records[name])
+        if not (finite | far if name in ('x', 'y', 'z') else finite).all():
+            raise InputError('~/matches must be finite')
     for view in '12':
-        rays = np.stack([records[axis + view].astype(np.float64) for axis in 'xyz'])
-        if (np.abs(np.linalg.norm(rays, axis=0) - 1.0) > _UNIT_TOLERANCE).any():
+        lengths = np.linalg.norm(_rays(records, view), axis=1)
+        if (np.abs(lengths - 1.0) > _UNIT_TOLERANCE).any():
             raise InputError(f'the rays x{view} y{view} z{view} of ~/matches must have length 1')
-    return records
+
+
+def _rays(records: NDArray[np.void], view: str) -> Array:
+    """Derotated rays (N, 3) in the camera '1' or '2'."""
+    return np.stack([records[axis + view].astype(np.float64) for axis in 'xyz'], axis=1)
+
+
+def _refuse_indefinite(information: Array) -> None:
+    """InputError unless an information (K, K) is positive semidefinite, and not absurdly large."""
+    values = np.linalg.eigvalsh(information)
+    least, most = values[0], values[-1]
+    # Written so that NaN is refused, too.
+    if not (-_LEAST_INFORMATION * most <= least and 0.0 < most < _MOST_INFORMATION):
+        raise InputError(
+            'image_information of ~/pairs must be positive semidefinite, with eigenvalues below '
+            f'{_MOST_INFORMATION:g}, got {least:.3g} to {most:.3g}: the pair is not used'
+        )
 
 
 def _unit(name: str, message: Any, axes: str) -> Array:
@@ -286,8 +315,7 @@ def _is_unit(values: Array) -> bool:
 
 
 def _velocity(name: str, vector: Any) -> Array:
-    largest = 1e9  # [baselines/s, rad/s]: above any camera, below an overflow
-    return validate.array(name, [vector.x, vector.y, vector.z], (3,), largest=largest)
+    return validate.array(name, [vector.x, vector.y, vector.z], (3,), largest=_LARGEST_SPEED)
 
 
 def _covariance(topic: str, covariance: Any, size: int) -> Array:
@@ -306,8 +334,13 @@ def _rotation(topic: str, quaternion: Any) -> Array:
 # and many tracks are observed in both: the ratio of a point's distances there, in the one baseline
 # and in the other, is the ratio of the baselines. Errors accumulate as in any odometry.
 
-# Squared sine of the angle between two rays; they are parallel below it.
+# Squared sine of the angle between two rays, below which they count as parallel and have no
+# distances. A larger bound would lose far tracks. [chosen: 1e-24, rounding, to 1e-10 would do]
 _PARALLEL = 1e-18
+# Sigma of a normal distribution over its median absolute deviation. [derived: 1 / 0.6745]
+_OF_DEVIATION = 1.4826
+# Sigma of the median of n normal deviates, over sigma / sqrt(n). [derived: sqrt(pi / 2)]
+_OF_MEDIAN = 1.2533
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -374,7 +407,8 @@ class PoseChain:
             self._end(f'a pair has no rotation ({pair.status})', new_axes=True)
             return PathStep((), '', False, scale, shared_tracks, sigma)
         start = np.eye(3) if self._R is None else self._R
-        self._stamp_ns, self._R = pair.stamp_ns, pair.R if self._R is None else start @ pair.R
+        self._stamp_ns = pair.stamp_ns
+        self._R = start @ pair.R
         if not pair and pair.status != Status.PURE_ROTATION.value:
             self._end(f'a pair has no translation ({pair.status})')
             return PathStep((), '', False, scale, shared_tracks, sigma)
@@ -391,12 +425,8 @@ class PoseChain:
     def _rescaled(self, pair: PublishedPair) -> tuple[float, int, float]:
         """Scale of a pair with a pose, its shared tracks, and the relative sigma of the ratio."""
         distances1, distances2 = track_distances(pair)
-        ratios = np.array(
-            [
-                self._distances[track] / distances1[track]
-                for track in distances1.keys() & self._distances.keys()
-            ]
-        )
+        shared = distances1.keys() & self._distances.keys()
+        ratios = np.array([self._distances[track] / distances1[track] for track in shared])
         if self._scale is not None and len(ratios) < self._min_shared_tracks:
             self._end(f'{len(ratios)} shared tracks, the scale needs {self._min_shared_tracks}')
         self._distances = distances2
@@ -426,13 +456,12 @@ def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, fl
     for both; without tracks behind a camera or with parallel rays.
     """
     m = pair.matches
-    f1 = np.stack([m[name] for name in ('x1', 'y1', 'z1')], axis=1).astype(np.float64)
-    f2 = np.stack([m[name] for name in ('x2', 'y2', 'z2')], axis=1).astype(np.float64) @ pair.R.T
+    f1, f2 = _rays(m, '1'), _rays(m, '2') @ pair.R.T
     tau = m['tau2'].astype(np.float64) - m['tau1']
-    baselines = pair.t + tau[:, None] * (pair.R @ pair.linear_velocity)
+    velocity = pair.R @ pair.linear_velocity  # in the reference camera
+    baselines = pair.t + tau[:, None] * velocity
     l1, l2, usable = depths_of_rays(f1, f2, baselines, _PARALLEL)
     tracks = m['id'][usable].tolist()
-    return (
-        dict(zip(tracks, l1[usable].tolist(), strict=True)),
-        dict(zip(tracks, l2[usable].tolist(), strict=True)),
-    )
+    of_reference = zip(tracks, l1[usable].tolist(), strict=True)
+    of_current = zip(tracks, l2[usable].tolist(), strict=True)
+    return dict(of_reference), dict(of_current)

@@ -17,10 +17,15 @@ from rs_relpose_ros.config.settings import Parameters
 
 Transform = tuple[float, ...]
 
-# Doubt of a transform, 1 sigma per axis: URDFs hold drawings, not calibrations [rad, m].
-AXES_SIGMA, POSITION_SIGMA = math.radians(5.0), 0.02
+# Doubt of a transform, 1 sigma per axis. URDFs hold drawings, not calibrations: a smaller sigma
+# would report the tolerance of a mount as a contradiction, a larger one would hide a wrong
+# transform. [chosen: 2 to 8 deg and 1 to 5 cm would do]
+AXES_SIGMA = math.radians(5.0)
+POSITION_SIGMA = 0.02  # [m]
 TF_TYPE = 'tf2_msgs/msg/TFMessage'
-# Messages of /tf that are read for a frame that /tf_static does not connect.
+# Number of messages of /tf that are read for a frame that /tf_static does not connect. More would
+# delay the start with a long bag, fewer miss a publisher of 1 Hz among fast ones.
+# [chosen: 100 to 10,000 would do]
 _MOST_MESSAGES = 1000
 
 _logger = logging.getLogger(__name__)
@@ -36,22 +41,25 @@ class FrameTree:
         """Add those of a tf2_msgs/TFMessage that are rigid transforms."""
         for stamped in message.transforms:
             t, q = stamped.transform.translation, stamped.transform.rotation
-            quaternion, pose = np.array([q.x, q.y, q.z, q.w]), np.eye(4)
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            pose = np.eye(4)
             pose[:3, 3] = t.x, t.y, t.z
-            if abs(np.linalg.norm(quaternion) - 1.0) < 1e-2 and np.isfinite(pose).all():
+            is_unit = abs(np.linalg.norm(quaternion) - 1.0) < 1e-2
+            if is_unit and np.isfinite(pose).all():
                 pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
                 # ROS 1 has names with and without a slash.
-                self._parents.setdefault(
-                    stamped.child_frame_id.lstrip('/'), (stamped.header.frame_id.lstrip('/'), pose)
-                )
+                child, parent = stamped.child_frame_id, stamped.header.frame_id
+                self._parents.setdefault(child.lstrip('/'), (parent.lstrip('/'), pose))
 
     def lookup(self, parent: str, child: str) -> Transform | None:
         """Pose of `child` in `parent`; None if they are not connected."""
-        (root, of_parent), (other, of_child) = map(self._in_root, (parent, child))
+        root, of_parent = self._in_root(parent)
+        other, of_child = self._in_root(child)
         if root != other:
             return None
         pose = np.linalg.inv(of_parent) @ of_child
-        return *map(float, pose[:3, 3]), *map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        return *pose[:3, 3].tolist(), *quaternion.tolist()
 
     def _in_root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
         frame, pose = frame.lstrip('/'), np.eye(4)
@@ -76,10 +84,8 @@ def extrinsics(
     rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
     if sensor.quat_cam_imu_xyzw is None:
-        values = {
-            'quat_cam_imu_xyzw': tuple(map(float, rotation.as_quat())),
-            'axes_sigma': AXES_SIGMA,
-        }
+        values = {'quat_cam_imu_xyzw': tuple(rotation.as_quat().tolist())}
+        values['axes_sigma'] = AXES_SIGMA
     elif angle := angle_between(rotation.as_matrix(), sensor.R_cam_imu, sensor.axes_sigma):
         return {}, (
             f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
@@ -120,30 +126,28 @@ class BagFrames(NamedTuple):
 
 def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
     """Frames of a `Bag` with `SensorTopics`; of /tf if /tf_static does not suffice (`base`)."""
-    camera, imu = (
-        next(
-            (
-                str(message.message.header.frame_id).lstrip('/')
-                for message in bag.messages([topic])
-            ),
-            '',
-        )
-        if topic is not None
-        else ''
-        for topic in (topics.image, topics.imu)
-    )
+    camera, imu = _frame_id(bag, topics.image), _frame_id(bag, topics.imu)
     frames = BagFrames(camera, imu, FrameTree())
+
+    def is_complete() -> bool:
+        base_known = not base or frames.tree.lookup(base, camera) is not None
+        return frames.imu_in_camera is not None and base_known
+
     for name, most in (('/tf_static', None), ('/tf', _MOST_MESSAGES)):
         found = [topic for topic in bag.topics if topic.name == name and topic.msgtype == TF_TYPE]
         for message in islice(bag.messages(found), most):
-            if (
-                most is not None
-                and frames.imu_in_camera is not None
-                and (not base or frames.tree.lookup(base, camera) is not None)
-            ):
+            if most is not None and is_complete():
                 break
             frames.tree.add(message.message)
     return frames
+
+
+def _frame_id(bag: Any, topic: Any) -> str:
+    """frame_id of the first message of a topic; empty without one."""
+    if topic is None:
+        return ''
+    first = next(iter(bag.messages([topic])), None)
+    return '' if first is None else str(first.message.header.frame_id).lstrip('/')
 
 
 def with_extrinsics(bag: Any, topics: Any, parameters: Parameters) -> tuple[Parameters, str]:
@@ -152,17 +156,14 @@ def with_extrinsics(bag: Any, topics: Any, parameters: Parameters) -> tuple[Para
     if not parameters.calibration.use_tf:
         return parameters, ''
     frames = bag_frames(bag, topics, base)
-    values, contradiction = (
-        ({}, '')
-        if (found := frames.imu_in_camera) is None
-        else (extrinsics(parameters, found, frames.camera, frames.imu))
-    )
-    if (
-        base
-        and parameters.odometry.base_to_camera is None
-        and (found := frames.tree.lookup(base, frames.camera))
-    ):
-        values['base_to_camera'] = found
+    values: dict[str, Any] = {}
+    contradiction = ''
+    if (found := frames.imu_in_camera) is not None:
+        values, contradiction = extrinsics(parameters, found, frames.camera, frames.imu)
+    if base and parameters.odometry.base_to_camera is None:
+        on_base = frames.tree.lookup(base, frames.camera)
+        if on_base is not None:
+            values['base_to_camera'] = on_base
     if values:
         _logger.info('from /tf_static: %s', ', '.join(values))
     return parameters.updated(values), contradiction
