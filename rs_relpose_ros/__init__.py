@@ -50,6 +50,7 @@ __all__ = [
     'warm_up',
 ]
 
+# Module of each public name, which is imported when the name is used.
 _HOMES = {
     'EstimatorConfig': 'config.settings',
     'Frame': 'pipeline.pair',

@@ -26,9 +26,13 @@ def save_picture(picture: Figure, path: Path) -> None:
             picture.savefig(file, format=path.suffix[1:], metadata={'Software': None})
 
 
+# File of the numbers of a run, in the folder of its results. [derived: interface]
 SUMMARY_FILE = 'summary.json'
-# Distinguishable in every kind of colour vision (Okabe and Ito).
-BLUE, ORANGE, GREEN, RED = '#0072B2', '#E69F00', '#009E73', '#D55E00'
+# Colours that are distinguishable in every kind of colour vision. [derived: Okabe and Ito]
+BLUE = '#0072B2'
+ORANGE = '#E69F00'
+GREEN = '#009E73'
+RED = '#D55E00'
 
 
 def refuse_existing(*paths: Path) -> None:
@@ -41,15 +45,10 @@ def refuse_existing(*paths: Path) -> None:
 def refuse_unwritable(folder: Path) -> None:
     """Raise an InputError if a folder cannot be created or written; it is not created."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    problem = (
-        'is a file'
-        if not nearest.is_dir()
-        else ''
-        if os.access(nearest, os.W_OK | os.X_OK)
-        else 'cannot be written'
-    )
-    if problem:
-        raise InputError(f'{nearest} {problem}: choose another directory for the results')
+    if nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK):
+        return
+    problem = 'cannot be written' if nearest.is_dir() else 'is a file'
+    raise InputError(f'{nearest} {problem}: choose another directory for the results')
 
 
 @contextmanager

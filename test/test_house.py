@@ -4,6 +4,7 @@ import ast
 from collections import Counter
 from collections.abc import Iterator
 import re
+import runpy
 
 from conftest import ROOT
 import pytest
@@ -105,6 +106,15 @@ def test_missing_files_and_names_are_found():
 @pytest.mark.parametrize('path', [*PROSE, ROOT / 'CONTRIBUTING.md'], ids=lambda path: path.name)
 def test_documents_name_files_that_exist(path):
     assert missing_files(path.read_text(encoding='utf-8')) == []
+
+
+def test_the_picture_shows_the_layers_and_modules_of_today():
+    """Drawn by docs/images/draw_architecture.py, which is run again after a module has moved."""
+    images = ROOT / 'docs' / 'images'
+    drawing = runpy.run_path(str(images / 'draw_architecture.py'))
+    assert (images / 'architecture.svg').read_text(encoding='utf-8') == drawing['picture']()
+    modules = [module for _, module in (*drawing['PAIR'], *drawing['COVARIANCE'])]
+    assert [name for name in modules if not (ROOT / PACKAGE / name).is_file()] == []
 
 
 @pytest.mark.parametrize(

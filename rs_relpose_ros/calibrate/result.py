@@ -123,6 +123,7 @@ class CalibrationResult:
 
 # Change of a gyro's bias from one start to the next [rad/s].
 _BIAS_CHANGE = 1e-3
+# Milliseconds in a second. [derived: definition]
 _MS = 1e3
 
 

@@ -44,6 +44,7 @@ from rs_relpose_ros.output_files import (
     written,
 )
 
+# Help of the command, with what it writes.
 HELP = (
     'Run check, calibrate or replay over many bags: on processes of this machine, one thread '
     'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
@@ -54,13 +55,23 @@ HELP = (
     'outliers. Exit code 1: some bags were refused, failed, or are not as they should be.'
 )
 
+# The table of all bags. [derived: interface]
 RESULTS_FILE = 'results.csv'
+# The picture of all bags. [derived: interface]
 PICTURE_FILE = 'overview.png'
+# File of one bag that says how its work ended and on what that depends. [derived: interface]
 _JOB_FILE = 'job.json'
+# Suffixes of bags that are files. [derived: formats that `bags.reader` opens]
 _BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 
-# How the work on a bag ended; findings: completed, and its exit code is 1; lost: its workers died.
-DONE, FINDINGS, REFUSED, FAILED, LOST = STATES = ('done', 'findings', 'refused', 'failed', 'lost')
+# How the work on a bag ended.
+DONE = 'done'
+FINDINGS = 'findings'  # completed with exit code 1
+REFUSED = 'refused'
+FAILED = 'failed'
+LOST = 'lost'  # the workers died
+# All of them, in the order of the summary.
+STATES = (DONE, FINDINGS, REFUSED, FAILED, LOST)
 # States that another run would not change.
 _LASTING = (DONE, FINDINGS, REFUSED)
 
@@ -71,11 +82,16 @@ _WORK: Mapping[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
     'replay': lambda args: replay_bag(args)[1].metrics,
 }
 
+# Bags that the report lists by name; the table has the others. [chosen: a screen of lines]
 _MOST_LINES = 20
-# How many workers may die over one bag before it is given up, less one.
+# A bag is given up when one more worker than this has died over it: a second death is no accident.
+# [chosen: each more costs the time of a run and a worker]
 _ALLOWED_DEATHS = 1
+# What is said without Dask.
 _ABSENT = "many bags need Dask, which is not installed: pip install 'dask[distributed]'"
-_TIMEOUT = 20.0  # to find a scheduler and its workers [s]
+# Longest time to find a scheduler and its workers [s]. A cluster takes seconds to start; a wrong
+# address is reported after this time. [chosen: any value in 10..60 would do]
+_TIMEOUT = 20.0
 
 # A row of the table by column: state, metrics of a completed command. Files of results by name.
 Row = dict[str, Any]
@@ -321,6 +337,7 @@ _CALIBRATED = (
     'gyro_bias_rad_per_s.1',
     'gyro_bias_rad_per_s.2',
 )
+# The parameter that is a rotation vector.
 _ROTATION = 'rotation_from_axis_map_rad'
 
 # Command -> column -> place in the results.
@@ -594,7 +611,8 @@ def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> l
 
 # -- Calibrations of one camera from many bags: weighted means and outliers -----------------------
 
-# Distance from the mean of the others beyond which a bag is an outlier [sigma].
+# Distance from the mean of the others beyond which a bag is an outlier [sigma]. [chosen: by chance
+# one bag of 370 is beyond 3]
 _OUTLIER = 3.0
 
 

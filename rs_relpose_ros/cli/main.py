@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from rs_relpose_ros.blas_threads import use_one_blas_thread
 from rs_relpose_ros.errors import library, MissingInputError, RsRelposeError
 
+# Name of the command line. [derived: console script of setup.py]
 PROGRAM = 'rs_relpose'
 
 # Each command's module (and its `Command` there), and one line of help. A module is imported only

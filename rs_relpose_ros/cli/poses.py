@@ -135,7 +135,7 @@ def _text(value: Any, unit: str) -> str:
     return f'no {unit}' if value is None else f'{value:.3g} {unit}'
 
 
-# The commands of this module. [derived: `cli.main.COMMANDS`]
+# `rs_relpose replay`.
 REPLAY = Command(
     'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
     '1) with the pipeline of relpose_node. Topics are found by type where that is unambiguous. '
@@ -197,6 +197,7 @@ def _pairs(args: argparse.Namespace) -> int:
     return 0 if counts['answered'] else FAILED
 
 
+# `rs_relpose pairs`.
 PAIRS = Command(
     "Estimate the relative poses of chosen pairs of a bag's images, any distance apart: loop "
     'closures, wide baselines. Images are matched by descriptors (SIFT, or ORB with --set '
@@ -283,6 +284,7 @@ def _odometry(args: argparse.Namespace) -> int:
     return 0
 
 
+# `rs_relpose odometry`.
 ODOMETRY = Command(
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
     'graph (gtsam, an extra), as in odometry_node. Writes trajectory.tum (live estimates of the '
@@ -376,6 +378,7 @@ def _print_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 
 
+# `rs_relpose export`.
 EXPORT = Command(
     'Export a bag for reconstruction and splatting: images, cameras with the pose of each row or '
     'what the format has for it, and points, metric with z up. Poses are those of `rs_relpose '

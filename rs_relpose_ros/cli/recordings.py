@@ -123,7 +123,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     return 0 if result.complete else FAILED
 
 
-# The commands of this module. [derived: `cli.main.COMMANDS`]
+# `rs_relpose calibrate`.
 CALIBRATE = Command(
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
     'without a target: readout time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
@@ -212,6 +212,7 @@ def _check(args: argparse.Namespace) -> int:
     return FAILED if report.failed else 0
 
 
+# `rs_relpose check`.
 CHECK = Command(
     'Check a bag (rosbag2 or ROS 1) for defects that degrade relative poses: topics, rates, gaps, '
     'stamps, clocks, encodings, transport; and, by a test run of half a minute of it, axes, time '
@@ -325,6 +326,7 @@ def _convert(args: argparse.Namespace) -> int:
     return 0
 
 
+# `rs_relpose convert`.
 CONVERT = Command(
     'Convert a recording to a rosbag2 directory (MCAP) with /camera/image_raw/compressed, '
     '/imu/data_raw (or /imu/gyro and /imu/accel if they have separate stamps), '
@@ -359,6 +361,7 @@ def _unroll(args: argparse.Namespace) -> int:
     return 0
 
 
+# `rs_relpose unroll`.
 UNROLL = Command(
     'Derotate every image of a bag (rosbag2 or ROS 1) by its gyro to the time of its middle row, '
     'and write a bag (MCAP) for SLAM systems without a model of the rolling shutter: images and '

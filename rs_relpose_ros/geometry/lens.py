@@ -182,6 +182,7 @@ class DistortionModel:
         return tuple(values)
 
 
+# The models by the name that CameraInfo has.
 DISTORTION_MODELS = {
     model.name: model
     for model in (

@@ -27,12 +27,15 @@ from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALU
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 
+# Name of the node. [derived: interface]
 NAME = 'global_shutter_node'
 
-# Queue of a third of a second of images.
+# Images that wait to be sent: a third of a second, so that a subscriber that pauses loses none.
+# [chosen: any value in 5..30 would do]
 _DEPTH = 10
-# Age of a state of relpose_node, which comes once a second [s].
+# Largest age of a state of relpose_node [s], which comes once a second. [chosen: two may be lost]
 _FRESH = 3.0
+# What --help prints.
 _DESCRIPTION = (
     'Derotated images of a rolling-shutter camera: every row rotated by the gyro to the time of\n'
     'the middle one.\n\n'

@@ -17,8 +17,10 @@ from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import fill_cache_if_empty, warm_up_pipeline
 from rs_relpose_ros.tracking.images import Pixels
 
+# Name of the node. [derived: interface]
 NAME = 'relpose_node'
 
+# What --help prints.
 _DESCRIPTION = (
     'Relative poses of a rolling-shutter camera, aided by an IMU.\n\n'
     'subscribes: image (or image/compressed with image_transport:=compressed), '

@@ -20,6 +20,8 @@ from rs_relpose_ros.offline.truth import PairErrors, rotation_angle, TrueTraject
 from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture, written
 from rs_relpose_ros.pipeline.pair import PairResult
 
+# Resolution of pictures [dots per inch]: labels stay readable at full width. [chosen: any value in
+# 90..150 would do]
 _DPI = 110
 
 

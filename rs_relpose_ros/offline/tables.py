@@ -88,6 +88,7 @@ def _pose_row(record: PairRecord) -> list[str]:
     ]
 
 
+# relative_poses.csv: a row for each pair.
 POSES = Table(
     'relative_poses.csv',
     (
@@ -144,6 +145,7 @@ def _error_row(record: PairRecord) -> list[str] | None:
     ]
 
 
+# errors.csv: a row for each pair with a true pose.
 ERRORS = Table(
     'errors.csv',
     (

@@ -14,6 +14,8 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 # Largest interval of two poses for an interpolation.
 _MAX_GAP_NS = to_nanoseconds(0.2)
+# Fewest poses of a ground truth: fewer are no trajectory to compare with. [chosen: any value in
+# 2..10 would do]
 _MIN_POSES = 4
 
 

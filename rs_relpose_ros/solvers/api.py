@@ -21,11 +21,16 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.solvers import angular, common, uniform
 from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solver
 
+# Rays derotated by the gyro, and velocities.
 UNIFORM = Model('uniform', derotated=True, velocities=True)
+# Rays as measured, and velocities.
 LINEAR = Model('linear', derotated=False, velocities=True)
+# Rays derotated by the gyro, and no velocities.
 ANGULAR = Model('angular', derotated=True, velocities=False)
+# Rays as measured, and no velocities.
 GLOBAL = Model('global', derotated=False, velocities=False)
 
+# The public table of solvers by name.
 SOLVERS = {
     solver.name: solver
     for solver in (

@@ -96,6 +96,7 @@ class Solver:
         return _INTERFACE.address(self.solve)
 
 
+# The one signature of all solvers.
 _INTERFACE = KernelInterface(
     numba.int64,
     Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))),

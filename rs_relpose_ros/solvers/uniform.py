@@ -22,12 +22,14 @@ MAX_9PT = 2 * _DEGREE_9
 # Most solutions with 11 points: one per start, and the 5-point solver gives the starts.
 # [derived: its number of solutions]
 MAX_11PT = MAX_5PT
-# From samples of the determinant to its coefficients, for 3 and for 9 points.
-# [derived: interpolation at the nodes below]
+# Matrix from samples of the determinant of 3 points to its coefficients. [derived: interpolation
+# at the nodes below]
 _MATRIX_3 = algebra.half_angle_matrix(_DEGREE_3)
+# The same for 9 points. [derived: as with 3 points]
 _MATRIX_9 = algebra.half_angle_matrix(_DEGREE_9)
-# Half angles of these samples. [derived: evenly distributed]
+# Half angles of the samples with 3 points. [derived: evenly distributed]
 _NODES_3 = algebra.half_angle_nodes(_DEGREE_3)
+# The same for 9 points. [derived: as with 3 points]
 _NODES_9 = algebra.half_angle_nodes(_DEGREE_9)
 
 
