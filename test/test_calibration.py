@@ -376,6 +376,20 @@ def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
     return problem, unknowns, truth
 
 
+def test_a_step_of_the_axes_turns_the_camera_and_that_of_the_lens_is_true_minus_assumed():
+    """R_true = Exp(c) R_cam_imu in the axes of the camera, and f_true = f exp(c)."""
+    _, unknowns, truth = few_pairs()
+    step = np.zeros(GLOBAL)
+    step[coplanarity.ROTATION] = 0.02, -0.01, 0.03
+    turned = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ unknowns.R_imu_cam.T
+    np.testing.assert_allclose(stepped(unknowns, step).R_imu_cam.T, turned, atol=1e-12)
+    camera = camera_of(truth)
+    moved = camera.moved_lens(coplanarity.LENS_BASIS @ [0.1, 0.02, 3.0, -4.0])
+    assert moved.fx == pytest.approx(camera.fx * math.exp(0.1))
+    assert (moved.cx - camera.cx, moved.cy - camera.cy) == pytest.approx((3.0, -4.0))
+    assert moved.distortion[0] == pytest.approx(0.02)
+
+
 def test_gradient_is_that_of_finite_differences():
     problem, unknowns, _ = few_pairs()
     # At the optimum of the pairs' own unknowns the total derivative is the partial one.

@@ -9,14 +9,14 @@ from rs_relpose_ros.core.deviations import (
     N_DEVIATIONS,
     OFFLINE,
     Selection,
-    slices,
 )
 from rs_relpose_ros.geometry import lens
 
 
-def test_parts_of_a_vector_follow_one_another():
-    parts = slices({'a': 2, 'b': 1})
-    assert parts == {'a': slice(0, 2), 'b': slice(2, 3)}
+def test_parts_of_the_vector_follow_one_another():
+    everything = Selection.of(*(entry.name for entry in ENTRIES))
+    ends = [0, *(part.stop for part in everything.parts.values())]
+    assert [part.start for part in everything.parts.values()] == ends[:-1]
     assert sum(entry.size for entry in ENTRIES) == N_DEVIATIONS
 
 

@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from rs_relpose_ros.core.deviations import OFFLINE, slices
+from rs_relpose_ros.core import deviations
+from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
@@ -122,8 +124,7 @@ def _evaluated(path: GyroPath, at: Array) -> Array:
 # -- Data and unknowns ----------------------------------------------------------------------------
 
 # Places of the parameters of the calibration, which are values of `OFFLINE` of `core.deviations`;
-# entries with more than one value have slices. The rotation vector `ROTATION` acts on the left of
-# R_imu_cam; the lens is beyond the assumed camera.
+# entries with more than one value have slices. The lens is beyond the assumed camera.
 READOUT = OFFLINE.index('readout_time')
 OFFSET = OFFLINE.index('time_offset')
 SLOPE = OFFLINE.index('offset_per_interval')
@@ -135,17 +136,19 @@ CENTER = OFFLINE.part('principal_point')
 EXPOSURE = OFFLINE.index('exposure_square')
 GLOBAL = OFFLINE.size
 LENS = slice(FOCAL, EXPOSURE)
+# Deviations of the lens in the order of `geometry.lens` by the parameters `LENS`, (7, 4).
+LENS_BASIS = np.ascontiguousarray(OFFLINE.basis[deviations.LENS, LENS])
 # Kernels need numbers in place of slices.
 _FIRST_AXIS = ROTATION.start
 _FIRST_BIAS = BIAS.start
 _OF_LENS = EXPOSURE - FOCAL
 # Places of the unknowns of a pair, after the parameters: step of the direction in its tangent
 # plane (2), bend (3), turn (3) [rad].
-_OWN = slices({'direction': 2, 'bend': 3, 'turn': 3})
-DIRECTION = GLOBAL + _OWN['direction'].start
-BEND = GLOBAL + _OWN['bend'].start
-TURN = GLOBAL + _OWN['turn'].start
-ALL = GLOBAL + _OWN['turn'].stop
+_UNKNOWNS = first_indices(parameters=GLOBAL, direction=2, bend=3, turn=3)
+DIRECTION = _UNKNOWNS['direction']
+BEND = _UNKNOWNS['bend']
+TURN = _UNKNOWNS['turn']
+ALL = _UNKNOWNS['end']
 LOCAL = ALL - GLOBAL
 # Residual [sigma] beyond which the Geman-McClure loss is nearly constant.
 ROBUST = 3.0
@@ -346,11 +349,11 @@ def _add_view(
     J[OFFSET] += by_time
     J[SLOPE] += covariate * by_time
     J[EXPOSURE] += dot(by_turn, rotated(sight.Q, sight.blur))
-    by_rotation = rotated_back(sight.Q, by_turn)
+    by_axes = rotated_back(sight.M, by_turn)  # R_imu_cam Exp(-c)
     by_bias = rotated_back(sight.by_bias, by_turn)
     by_own_turn = rotated_back(Q_middle, by_turn)
     for i in range(3):
-        J[_FIRST_AXIS + i] += by_rotation[i]
+        J[_FIRST_AXIS + i] -= by_axes[i]
         J[_FIRST_BIAS + i] -= by_bias[i]
         J[TURN + i] += share * by_own_turn[i]
 

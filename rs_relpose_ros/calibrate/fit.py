@@ -131,14 +131,14 @@ def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
     parameters[ROTATION] = 0.0
-    rotation = Rotation.from_rotvec(step[ROTATION]).as_matrix()
+    back = Rotation.from_rotvec(-step[ROTATION]).as_matrix()
     # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
     direction = unknowns.own[:, :3] + np.einsum('pk,pki->pi', along, _tangents(unknowns))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return unknowns._replace(
         parameters=parameters,
-        R_imu_cam=rotation @ unknowns.R_imu_cam,
+        R_imu_cam=unknowns.R_imu_cam @ back,
         own=np.hstack([direction, unknowns.own[:, 3:] + local[:, 2:]]),
     )
 
@@ -583,7 +583,7 @@ def _disagreement(final: Fit) -> Array:
         for part in (first, ~first)
     )
     difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION] = log_so3(one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
+    difference[ROTATION] = log_so3(one.unknowns.R_imu_cam.T @ other.unknowns.R_imu_cam)
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
     variances = np.maximum(
         np.diag(one.covariance + other.covariance), 2.0 * np.diag(final.covariance)

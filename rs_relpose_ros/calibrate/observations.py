@@ -21,7 +21,6 @@ from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
@@ -225,20 +224,6 @@ def noise_density(times: Array, rates: Array) -> float:
     return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
 
 
-def with_lens(camera: RollingShutterCamera, lens: Array) -> RollingShutterCamera:
-    """Camera moved by ``[log focal length, first coefficient, principal point (2) [px]]``."""
-    counts = DISTORTION_MODELS[camera.distortion_model].coefficient_counts
-    first, *others = camera.distortion or (0.0,) * max(counts[0], 4)
-    return replace(
-        camera,
-        fx=camera.fx * math.exp(lens[0]),
-        fy=camera.fy * math.exp(lens[0]),
-        distortion=(first + float(lens[1]), *others),
-        cx=camera.cx + float(lens[2]),
-        cy=camera.cy + float(lens[3]),
-    )
-
-
 # Frames further apart than so many intervals have lost some in between.
 _LOST = 1.5
 _LEAST_PAIRS = 10
@@ -253,8 +238,6 @@ _BEND_AT_START = 0.1
 # lens: first coefficient of the distortion, principal point as a share of the width.
 _BIAS_SIGMA, _SLOPE_SIGMA = 0.03, 1.0
 _RADIAL_SIGMA, _CENTER_SIGMA = 0.3, 0.015
-# Steps of the lens [1, 1, px, px] for its derivatives.
-_LENS_STEPS = (1e-5, 1e-5, 1e-2, 1e-2)
 # Error of the rotation between two frames of a gyro without noise, by its sampling [rad].
 _LEAST_ROTATION = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.
@@ -267,7 +250,7 @@ class Observations:
 
     tracks: Tracks  # of points that the camera model can map to rays
     camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
-    lens: Array  # (4,) as of `with_lens`
+    lens: Array  # (4,) parameters `coplanarity.LENS`
     times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes
     exposure: Exposure  # before the fit
@@ -287,7 +270,7 @@ class Observations:
     ) -> Observations:
         """Observations of at least two frames and two samples."""
         lens = np.array(lens)
-        camera = with_lens(camera, lens)
+        camera = camera.moved_lens(model.LENS_BASIS @ lens)
         rays = camera.unproject(tracks.points)
         ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > _LEAST_COSINE)
         tracks = replace(
@@ -384,12 +367,7 @@ class Observations:
         blur_turns = cumulative_trapezoid(self.blur_rates, self.gyro_times, axis=0, initial=0.0)
         pixels = self.tracks.points[np.hstack([pair.rows for pair in pairs])]
         height = self.camera.height
-        points, by_pixel = _normalized(self.camera, pixels)
-        by_lens, by_both = np.empty((*points.shape, 4)), np.empty((*by_pixel.shape, 4))
-        for k, step in enumerate(_LENS_STEPS):
-            moved = _normalized(with_lens(self.camera, step * np.eye(4)[k]), pixels)
-            by_lens[..., k] = (moved[0] - points) / step
-            by_both[..., k] = (moved[1] - by_pixel) / step
+        of_pixels = self.camera.points_by_lens(pixels.reshape(-1, 2))
         return model.Problem(
             self.gyro_times,
             self.gyro_rates,
@@ -400,24 +378,15 @@ class Observations:
             np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]),
             middles,
             (pixels[:, :, 1] - 0.5 * (height - 1)) / height,
-            points,
-            by_pixel,
-            by_lens,
-            by_both,
+            of_pixels.values.reshape(pixels.shape),
+            of_pixels.by_pixel.reshape(*pixels.shape, 2),
+            (of_pixels.by_lens @ model.LENS_BASIS).reshape(*pixels.shape, 4),
+            (of_pixels.by_pixel_by_lens @ model.LENS_BASIS).reshape(*pixels.shape, 2, 4),
             np.full(len(pairs), _BEND_AT_START),
             turn_sigma,
             prior,
             center,
         )
-
-
-def _normalized(camera: RollingShutterCamera, pixels: Array) -> tuple[Array, Array]:
-    """Normalised points (2, N, 2) of pixels, and their derivatives (2, N, 2, 2) by them."""
-    rays, by_pixel = camera.unproject_with_jacobian(pixels.reshape(-1, 2))
-    # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
-    points = rays[:, :2] / rays[:, 2:]
-    by_pixel = (by_pixel[:, :2] - points[:, :, None] * by_pixel[:, 2:]) / rays[:, 2:, None]
-    return points.reshape(pixels.shape), by_pixel.reshape(*pixels.shape, 2)
 
 
 # -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------

@@ -143,11 +143,10 @@ def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tup
     covariance = final.covariance.copy()
     _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS], R.T)
     if one_axis:  # about which the fit means nothing
-        axis = R @ axis
         covariance[part] -= np.outer(axis, axis @ covariance[part])
         covariance[:, part] -= np.outer(covariance[:, part] @ axis, axis)
         covariance[part, part] += _ANY_ANGLE**2 * np.outer(axis, axis)
-    turn = log_so3(np.ascontiguousarray((R @ R_prior).T))
+    turn = log_so3(R_prior @ R)
     # As `angle_between`, axis by axis.
     if (
         turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part], turn)
@@ -325,8 +324,7 @@ def evaluated(
     # Row 0 is read this share of the readout before the middle row.
     to_first, height = np.zeros(model.GLOBAL), data.camera.height
     to_first[[model.OFFSET, model.READOUT]] = 1.0, -0.5 * (height - 1) / height
-    part = model.ROTATION  # about the axes of the camera
-    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
+    rotation_sigma = sigmas[model.ROTATION]
     axis_map = observations.nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
 
@@ -335,7 +333,7 @@ def evaluated(
 
     slope = lens = None
     if final.free[model.FOCAL]:
-        camera = observations.with_lens(data.camera, parameters[model.LENS])
+        camera = data.camera.moved_lens(model.LENS_BASIS @ parameters[model.LENS])
         focal, *others = sigmas[model.LENS]
         factor = math.exp(data.lens[0] + parameters[model.FOCAL])
         lens = LensEstimates(

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.geometry import Array
 
 
@@ -36,7 +37,7 @@ class Entry(NamedTuple):
 ENTRIES = (
     # R_true = Exp(c) R_cam_imu, in the axes of the camera.
     Entry('axes', 3, 'rad', 0.2, 0.5),
-    # t_imu = t_image + time_offset, of the stamped row.
+    # t_imu = t_image + time_offset, of the middle row.
     Entry('time_offset', 1, 's', 0.05, 0.06),
     # Change of time_offset by the covariate of a frame, such as its interval.
     Entry('offset_per_interval', 1, 's/s', 1.0, 2.0),
@@ -47,7 +48,7 @@ ENTRIES = (
     Entry('gyro_scale', 3, '', 0.2, 0.3),
     # w_true = (I + M) w with M symmetric, zero on its diagonal: yz, xz, xy.
     Entry('gyro_skew', 3, 'rad', 0.005, 0.02),
-    # The next four are those of `geometry.lens`, in its order. Both focal lengths by one factor.
+    # The next four are those of `geometry.lens`, in its order. f_true = f exp(c), both.
     Entry('focal_log', 1, '', 0.3, 0.45),
     # fy / fx.
     Entry('aspect', 1, '', 0.002, 0.01),
@@ -59,18 +60,16 @@ ENTRIES = (
 )
 
 
-def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Places of named parts of a vector, one after the other."""
-    places, start = {}, 0
-    for name, size in sizes.items():
-        places[name] = slice(start, start + size)
-        start += size
-    return places
+def _slices(sizes: dict[str, int]) -> dict[str, slice]:
+    first = first_indices(**sizes)
+    return {name: slice(first[name], first[name] + size) for name, size in sizes.items()}
 
 
-_PARTS = slices({entry.name: entry.size for entry in ENTRIES})
+_PARTS = _slices({entry.name: entry.size for entry in ENTRIES})
 # Number of values of the whole vector.
 N_DEVIATIONS = sum(entry.size for entry in ENTRIES)
+# Places of the entries of `geometry.lens` in the whole vector.
+LENS = slice(_PARTS['focal_log'].start, _PARTS['principal_point'].stop)
 
 # Basis (3, 1) of one value that is common to the three components of an entry.
 COMMON = np.ones((3, 1))
@@ -99,7 +98,7 @@ class Selection:
         chosen = [entry for entry in ENTRIES if entry.name in {*names, *bases}]
         own = [bases.get(entry.name, np.eye(entry.size)) for entry in chosen]
         sizes = [basis.shape[1] for basis in own]
-        parts = slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
+        parts = _slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
         whole = np.zeros((N_DEVIATIONS, sum(sizes)))
         for (name, part), basis in zip(parts.items(), own, strict=True):
             whole[_PARTS[name], part] = basis
@@ -134,7 +133,8 @@ class Selection:
         return chosen
 
 
-# Deviations that the live monitor estimates from the pairs of the last seconds.
+# Deviations that the live monitor estimates from the pairs of the last seconds. Its `time_offset`
+# is that of the stamped row, as the parameter: `by_stamped_row`.
 LIVE = Selection.of(
     'axes',
     'time_offset',
@@ -156,3 +156,13 @@ OFFLINE = Selection.of(
     'exposure_square',
     distortion=FIRST,
 )
+
+
+def by_stamped_row(selection: Selection, share: float) -> Array:
+    """Basis (N_DEVIATIONS, k) of a selection whose `time_offset` is that of the stamped row.
+
+    The middle row is read `share` of the readout after the stamped row, and so are its deviations.
+    """
+    basis = selection.basis.copy()
+    basis[_PARTS['time_offset'], selection.part('readout_time')] = share
+    return basis

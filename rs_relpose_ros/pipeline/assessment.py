@@ -451,8 +451,8 @@ def _values(
         sigma *= math.degrees(1.0)
     elif quantity.code is Code.READOUT_TIME:  # the deviation is that of the signed one
         estimated = active + configured.direction * left
-    elif quantity.code is Code.FOCAL_LENGTH:  # the deviation is that of its inverse
-        estimated = active / (1.0 + left)
+    elif quantity.code is Code.FOCAL_LENGTH:  # the deviation is that of its logarithm
+        estimated = active * np.exp(left)
         sigma *= float(estimated[0])
     return Finding(
         quantity.code,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.deviations import LENS, LIVE
 from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator import priors
@@ -266,14 +266,7 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
     """The camera with deviations of focal length and distortion."""
     if not (focal or distortion):
         return camera
-    coefficients = list(camera.distortion) or [0.0] * 4
-    coefficients[0] += distortion
-    return replace(
-        camera,
-        fx=camera.fx / (1.0 + focal),
-        fy=camera.fy / (1.0 + focal),
-        distortion=tuple(coefficients) if any(coefficients) else camera.distortion,
-    )
+    return camera.moved_lens(LIVE.basis[LENS, _LENS:] @ (focal, distortion))
 
 
 def _gyro(pair: PairData) -> Array:
@@ -302,14 +295,14 @@ def _by_lens(pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -
         rays, jacobian = camera.unproject_with_jacobian(
             np.concatenate(
                 [
-                    centre + (1.0 + _STEP) * (points - centre),
+                    centre + (1.0 - _STEP) * (points - centre),
                     points,
                     points - (_STEP, 0.0),
                     points - (0.0, _STEP),
                 ]
             )
         )
-        jacobian[:n] *= 1.0 + _STEP
+        jacobian[:n] *= 1.0 - _STEP
         rays[n : 2 * n], jacobian[n : 2 * n] = _lens(camera, 0.0, _STEP).unproject_with_jacobian(
             points
         )
