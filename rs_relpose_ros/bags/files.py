@@ -28,7 +28,9 @@ from rs_relpose_ros.bags.storage import (
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
-_SUFFIXES = ('.mcap', '.db3', '.bag')
+# Suffixes of the files of a bag. [derived: the kinds of `Source`]
+SUFFIXES = ('.mcap', '.db3', '.bag')
+# What recorders of rosbag2 write beside the files. [derived: rosbag2]
 _METADATA = 'metadata.yaml'
 # Bytes of the largest metadata.yaml that is parsed. A larger one is ignored; parsing it would take
 # minutes. [chosen: thousands of topics need less than a megabyte]
@@ -157,7 +159,7 @@ def _files_of(folder: Path, metadata: Metadata) -> list[Path]:
                 f'{folder} is damaged: {" and ".join(metadata.files)}, which its {_METADATA} '
                 'names, is not there: copy it again'
             )
-        raise InputError(f'{folder} is no bag: it has no {_METADATA} and no {_or(_SUFFIXES)} file')
+        raise InputError(f'{folder} is no bag: it has no {_METADATA} and no {_or(SUFFIXES)} file')
     if not listed:
         if not (folder / _METADATA).exists():
             _logger.warning(
@@ -189,7 +191,7 @@ def _files_of(folder: Path, metadata: Metadata) -> list[Path]:
 def _storage_files(folder: Path) -> Iterator[Path]:
     for file in folder.iterdir():
         name = file.name.removesuffix('.zstd')
-        if file.is_file() and name.endswith(_SUFFIXES):
+        if file.is_file() and name.endswith(SUFFIXES):
             yield file
 
 
@@ -249,7 +251,7 @@ def _source(file: Path, path: Path) -> Source | None:
     for source in Source:
         if begin.startswith(source.value):
             return source
-    if file == path and file.suffix not in (*_SUFFIXES, '.active'):
+    if file == path and file.suffix not in (*SUFFIXES, '.active'):
         raise InputError(
             f'{path} is no bag: give a rosbag2 directory (with {_METADATA}) or '
             'a .mcap, .db3 or .bag file'

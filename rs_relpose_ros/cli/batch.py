@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.bags.files import SUFFIXES
 from rs_relpose_ros.calibrate.result import as_mapping
 from rs_relpose_ros.cli.main import FAILED as EXIT_FAILED
 from rs_relpose_ros.cli.main import make_parser, package_version
@@ -61,8 +62,6 @@ RESULTS_FILE = 'results.csv'
 PICTURE_FILE = 'overview.png'
 # File of one bag that says how its work ended and on what that depends. [derived: interface]
 _JOB_FILE = 'job.json'
-# Suffixes of bags that are files. [derived: formats that `bags.reader` opens]
-_BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 
 # How the work on a bag ended.
 DONE = 'done'
@@ -235,7 +234,7 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
         matching = sorted(
             path
             for path in map(Path, glob.glob(pattern))  # noqa: PTH207 any root
-            if (path / 'metadata.yaml').is_file() or path.suffix in _BAG_SUFFIXES
+            if (path / 'metadata.yaml').is_file() or path.suffix in SUFFIXES
         )
         for path in matching or [Path(pattern)]:
             states = [
@@ -261,7 +260,7 @@ def unique_names(paths: Sequence[str]) -> list[str]:
     bags = [Path(path).absolute() for path in paths]
     common = os.path.commonpath([bag.parent for bag in bags])
     long = [bag.relative_to(common) for bag in bags]
-    short = [name.with_suffix('') if name.suffix in _BAG_SUFFIXES else name for name in long]
+    short = [name.with_suffix('') if name.suffix in SUFFIXES else name for name in long]
     return ['__'.join(name.parts) for name in (short if len({*short}) == len(short) else long)]
 
 
