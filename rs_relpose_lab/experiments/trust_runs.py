@@ -173,6 +173,9 @@ class SimulatedTracker:
         self._ids = TrackIds()
         self.reset()
 
+    def allow(self, allowed: NDArray[np.uint8] | None) -> None:
+        """Numbered images have no texture, and nothing in them is excluded."""
+
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
         self._frame = self._reference = -1

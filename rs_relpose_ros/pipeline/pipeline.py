@@ -30,6 +30,7 @@ from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result, TrackHistory
 from rs_relpose_ros.pipeline.recursion import PairData
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
+from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking.features import make_tracker, Tracker
 
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
@@ -91,6 +92,7 @@ class Pipeline(Processor[PairResult]):
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
         self._monitor = ConsistencyMonitor()
+        self.still = StillView()
         self._sensor: Sensor | None = None
         self._readout = 0.0  # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
@@ -126,14 +128,16 @@ class Pipeline(Processor[PairResult]):
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if history is None or previous is None or step is None:
             self._tracker.start(frame.image)
+            self.still.start(frame.stamp_ns, frame.image)
             self._restart_from(frame)
             return None
-        predicted = self._predicted(
-            previous.imu.motion,
-            frame.imu.motion,
-            step.rotation,
-            sensor,
-        )
+        new = self.still.imu_of_new(frame.stamp_ns, frame.image, frame.imu, previous.imu, sensor)
+        if new is None:
+            return None
+        frame.imu_data, step = new, new.since_previous
+        assert step is not None
+        self._tracker.allow(self.still.allowed(*frame.image.shape))
+        predicted = self._predicted(previous.imu.motion, frame.imu.motion, step.rotation, sensor)
         passed = seconds_between(previous.stamp_ns, frame.stamp_ns)
         matches = self._tracker.track(frame.image, predicted, passed)
         self._previous = frame

@@ -39,8 +39,11 @@ def find_corners(
     taken: Array,
     count: int,
     config: TrackingConfig,
+    allowed: Image | None = None,
 ) -> Array:
     """At most `count` new corners (K, 2) [px], at a distance from existing ones `taken` (M, 2).
+
+    `allowed` (H, W) is not zero where corners may lie; None allows the whole image.
 
     The best of each cell of a grid first, then the second best, and so on. Whole pixels: the
     accuracy of a match is that of the second point relative to the first one.
@@ -60,6 +63,9 @@ def find_corners(
     free = np.zeros(image.shape, dtype=np.uint8)
     free[top:bottom, margin:-margin] = 255
     free[-margin:] = 0
+    if allowed is not None:
+        reduced = cv2.resize(allowed, free.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        free[reduced == 0] = 0
     _occupy(free, taken / scale, math.ceil(distance))
     points = scale * _strong_corners(
         image,
@@ -112,7 +118,17 @@ def feature_rows(config: TrackingConfig, height: int) -> tuple[float, float]:
     return (first, last) if last > 0.0 else (first, height - 1.0)
 
 
-def keep_apart(points: Array, radius: float) -> Flags:
+def within(points: Array, allowed: Image | None) -> NDArray[np.bool_]:
+    """Mask (N,) of points (N, 2) of an image that lie where `allowed` (H, W) is not zero."""
+    if allowed is None:
+        return np.ones(len(points), dtype=bool)
+    height, width = allowed.shape
+    u, v = np.rint(np.nan_to_num(points, nan=-1.0)).astype(np.int64).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return np.asarray(inside & (allowed[v.clip(0, height - 1), u.clip(0, width - 1)] > 0))
+
+
+def keep_apart(points: Array, radius: float) -> NDArray[np.bool_]:
     """Mask (N,) of points (N, 2) that are not within `radius` of one before them."""
     kept = np.ones(len(points), dtype=bool)
     if len(points) > 1:
@@ -184,7 +200,12 @@ class DescriptorTracker:
             self._norm = cv2.NORM_HAMMING
             self._depth = cv2.CV_32S
         self._ids = TrackIds()
+        self._allowed: Image | None = None
         self.reset()
+
+    def allow(self, allowed: Image | None) -> None:
+        """Search features where `allowed` (H, W) is not zero; None allows the whole image."""
+        self._allowed = allowed
 
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
@@ -259,6 +280,7 @@ class DescriptorTracker:
         _, once = np.unique(points, axis=0, return_index=True)
         kept = np.sort(once)
         kept = kept[(points[kept, 1] >= first) & (points[kept, 1] <= last)]
+        kept = kept[within(points[kept], self._allowed)]
         return _Keypoints(
             self._ids.take(len(kept)), points[kept], np.ascontiguousarray(descriptors[kept])
         )
@@ -305,6 +327,9 @@ class Tracker(Protocol):
     @property
     def tracked_fraction(self) -> float:
         """Share of the reference's features that are still tracked."""
+
+    def allow(self, allowed: Image | None) -> None:
+        """Search features where `allowed` (H, W) is not zero; None allows the whole image."""
 
     def start(self, image: Image) -> None:
         """Make `image` (H, W) the reference keyframe."""

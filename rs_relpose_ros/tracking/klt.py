@@ -287,7 +287,12 @@ class KltTracker:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._ids = features.TrackIds()
+        self._allowed: Image | None = None
         self.reset()
+
+    def allow(self, allowed: Image | None) -> None:
+        """Search corners where `allowed` (H, W) is not zero; None allows the whole image."""
+        self._allowed = allowed
 
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
@@ -363,6 +368,7 @@ class KltTracker:
         self._guesses_near = bool(np.count_nonzero(far) <= _MOST_FAR * len(off))
         first, last = features.feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
+        good &= features.within(found, self._allowed)
         self._set(self._matches.followed(found), (found - predicted) / interval, good)
         self._current = current
         self._refined = False
@@ -398,8 +404,9 @@ class KltTracker:
         new = features.find_corners(
             self._current,
             kept,
-            wanted,
+            self._config.max_features - len(kept),
             self._config,
+            self._allowed,
         )
         points = np.concatenate([kept, new])
         ids = np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))])

@@ -1,0 +1,157 @@
+"""Images and parts of images that stay still although the gyro says that the camera turns.
+
+A driver that sends the last image again, a caption, a dirty lens, the legs of a drone and the
+cabin of a vehicle have one property: where a rotation of the camera has to move the image, the
+image does not change. The change is compared cell by cell with the change that the rotation alone
+would make:
+
+    D = mean |I_k - I_j|,    E = mean |W(I_j) - I_j|    [gray levels], over the pixels of a cell
+
+with I_j the last image that was new, I_k the current image, both reduced in size, and W(I_j) the
+image I_j moved by the rotation. A cell is informative where E is large, and still where D is small
+against E. An image whose informative cells are all still is a repetition of the image before.
+A cell that is still in most of the images of some seconds is static.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.tracking.images import Image
+
+Flags = NDArray[np.bool_]
+
+# Columns and rows of the cells. [chosen: a cell of 40 px in 640x480 holds some texture, and a
+# static part of a tenth of the image covers several cells; 10..24 columns would do]
+COLUMNS = 16
+ROWS = 12
+# Width of the reduced image [px]. Averaging reduces the noise of the sensor and of the
+# compression; a smaller image loses the texture. [chosen: 10 px for each cell]
+_WIDTH = 160
+# Least motion [px of the reduced image] that the rotation has to make in an informative cell. Less
+# motion changes the image by no more than its noise. [derived: a change of half the gradient]
+_LEAST_MOTION = 0.5
+# Least change E of an informative cell [gray levels]. [derived: five times the noise of a mean of
+# 4 x 4 pixels with a noise of 1.6 gray levels]
+_LEAST_CHANGE = 2.0
+# Largest D of a still cell as a share of E. Cells that move as the rotation says have D / E of
+# about 1; repeated images that are compressed again have 0.02 to 0.15. [measured: walks in three
+# scenes, images with noise of 0.8 gray levels compressed again: see test_still.py]
+_STILL = 0.25
+# Least share of the cells that have to be informative for a verdict on the whole image. A wall
+# without texture tells nothing. [chosen: a tenth to a half would do]
+_INFORMATIVE = 0.2
+# Least share of the informative cells that have to be still in a repeated image. A window in the
+# cabin of a vehicle moves in a smaller share. [chosen: a few cells may flicker]
+_ALL = 0.97
+# Time over which cells are counted [ns]. In a shorter time a person may keep one point of the
+# scene at its place in the image. [chosen: 3 to 10 s would do]
+_WINDOW_NS = to_nanoseconds(5.0)
+# Least number of images of that time in which a static cell has to be informative. Fewer images
+# name a static part by chance. [chosen: a walk of 5 s has 150 images, 50 of which turn enough]
+_LEAST_IMAGES = 20
+# Least share of these images in which a static cell is still. A cell at the border of a static
+# part is still in about half of the images. [chosen: 0.7 to 0.9 would do]
+_STATIC = 0.8
+
+
+class Change(NamedTuple):
+    """Verdict on one image."""
+
+    repeated: bool  # whether the image is the one before, and no new image
+    static: Flags  # (ROWS, COLUMNS) cells that are static by now
+
+
+class StillParts:
+    """Compares images with the rotation of the camera, in the order of time."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        self._before: NDArray[np.float32] | None = None  # the last new image, reduced
+        self._counted: deque[tuple[int, Flags, Flags]] = deque()
+
+    def add(self, stamp_ns: int, image: Image, motion: Array) -> Change:
+        """Add the next image (H, W).
+
+        `motion` (ROWS, COLUMNS, 2): displacement [px] of the centres of the cells by the rotation
+        since the last new image; NaN where it is not known. The first image needs none.
+        """
+        height, width = image.shape
+        scale = _WIDTH / width
+        size = (_WIDTH, max(round(height * scale), ROWS))
+        reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        before = self._before
+        if before is None or before.shape != reduced.shape:
+            self._before = reduced
+            return Change(False, self.static())
+        informative, still = _compared(before, reduced, motion * scale)
+        enough = informative.mean() >= _INFORMATIVE
+        repeated = bool(enough and still[informative].mean() >= _ALL)
+        if not repeated:
+            self._count(stamp_ns, informative, still)
+            self._before = reduced
+        return Change(repeated, self.static())
+
+    def static(self) -> Flags:
+        """Cells (ROWS, COLUMNS) that are static by the images of the last seconds."""
+        if not self._counted:
+            return np.zeros((ROWS, COLUMNS), dtype=bool)
+        informative = sum(one.astype(int) for _, one, _ in self._counted)
+        still = sum(one.astype(int) for _, _, one in self._counted)
+        return np.asarray((informative >= _LEAST_IMAGES) & (still >= _STATIC * informative))
+
+    def _count(self, stamp_ns: int, informative: Flags, still: Flags) -> None:
+        self._counted.append((stamp_ns, informative, still & informative))
+        while self._counted[0][0] < stamp_ns - _WINDOW_NS:
+            self._counted.popleft()
+
+
+def cell_centres(width: int, height: int) -> Array:
+    """Pixels (ROWS, COLUMNS, 2) of the centres of the cells of an image."""
+    u = (np.arange(COLUMNS) + 0.5) * (width / COLUMNS) - 0.5
+    v = (np.arange(ROWS) + 0.5) * (height / ROWS) - 0.5
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def free_of(static: Flags, width: int, height: int) -> NDArray[np.uint8]:
+    """Mask (H, W): 255 where new features may lie, 0 in static cells and their neighbours."""
+    grown = cv2.dilate(static.astype(np.uint8), np.ones((3, 3), dtype=np.uint8))
+    mask = cv2.resize(255 * (1 - grown), (width, height), interpolation=cv2.INTER_NEAREST)
+    return mask.astype(np.uint8, copy=False)
+
+
+def _compared(
+    before: NDArray[np.float32], now: NDArray[np.float32], motion: Array
+) -> tuple[Flags, Flags]:
+    """Which cells (ROWS, COLUMNS) are informative, and which of all cells are still."""
+    height, width = before.shape
+    known = np.isfinite(motion).all(axis=2)
+    field = np.nan_to_num(motion).astype(np.float32)
+    dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    # The content of a pixel comes from where the motion began.
+    moved = cv2.remap(
+        before,
+        u - dense[..., 0],
+        v - dense[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+    expected = _cell_means(np.abs(moved - before))
+    seen = _cell_means(np.abs(now - before))
+    turned = np.linalg.norm(field, axis=2) >= _LEAST_MOTION
+    informative = known & turned & (expected >= _LEAST_CHANGE)
+    return np.asarray(informative), np.asarray(seen < _STILL * expected)
+
+
+def _cell_means(values: NDArray[np.float32]) -> Array:
+    means = cv2.resize(values, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
+    return np.asarray(means, dtype=np.float64)

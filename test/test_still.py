@@ -1,0 +1,112 @@
+"""Repeated images and static parts of images: compared with a rotation of the camera."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_relpose_lab.simulation.scene import make_texture
+from rs_relpose_ros.config.settings import TrackingConfig
+from rs_relpose_ros.tracking import still
+from rs_relpose_ros.tracking.features import find_corners, make_tracker, within
+from rs_relpose_ros.tracking.still import COLUMNS, ROWS, StillParts
+
+WIDTH, HEIGHT = 320, 240
+INTERVAL_NS = 33_000_000
+
+
+def walk(count, static=None, seed=3, step=(5.0, 1.5)):
+    """Images that move by about `step` px each, with noise, and their motions."""
+    rng = np.random.default_rng(seed)
+    texture = make_texture(rng, (700, 1400)).astype(float)
+    fixed = make_texture(rng, (HEIGHT, WIDTH)).astype(float)
+    place = np.array([700.0, 300.0])
+    for _ in range(count):
+        motion = np.array(step) * rng.normal(size=2)
+        place = np.clip(place + motion, (20, 20), (1060, 440))
+        matrix = np.array([[1.0, 0.0, place[0]], [0.0, 1.0, place[1]]])
+        image = cv2.warpAffine(
+            texture, matrix, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        if static is not None:
+            image = np.where(static, fixed, image)
+        yield place.copy(), np.clip(image + rng.normal(size=image.shape), 0, 255).astype(np.uint8)
+
+
+def added(parts, number, image, motion):
+    """The verdict on an image whose content moves by `motion` (2,) px against the last new one."""
+    return parts.add(number * INTERVAL_NS, image, np.broadcast_to(motion, (ROWS, COLUMNS, 2)))
+
+
+def test_images_of_a_moving_camera_are_new():
+    parts, before = StillParts(), None
+    for number, (place, image) in enumerate(walk(120)):
+        change = added(parts, number, image, np.zeros(2) if before is None else before - place)
+        assert not change.repeated
+        assert not change.static.any()
+        before = place
+
+
+def test_repeated_images_are_found_whatever_their_bytes():
+    parts, before, rng = StillParts(), None, np.random.default_rng(5)
+    found = []
+    for number, (place, image) in enumerate(walk(60, step=(9.0, 9.0))):
+        motion = np.zeros(2) if before is None else before - place
+        change = added(parts, 2 * number, image, motion)
+        assert not change.repeated
+        before = place
+        again = np.clip(image + 1.0 * rng.normal(size=image.shape), 0, 255).astype(np.uint8)
+        again = cv2.imdecode(cv2.imencode('.jpg', again)[1], cv2.IMREAD_GRAYSCALE)
+        found.append(added(parts, 2 * number + 1, again, np.array([6.0, -4.0])).repeated)
+    assert sum(found) >= 0.8 * len(found)
+
+
+def test_a_camera_at_rest_repeats_nothing():
+    """Without a rotation there is no evidence that the image had to change."""
+    parts = StillParts()
+    image = next(walk(1))[1]
+    assert not any(added(parts, k, image, np.array([0.3, 0.2])).repeated for k in range(50))
+
+
+def test_a_wall_without_texture_repeats_nothing():
+    parts = StillParts()
+    image = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)
+    assert not any(added(parts, k, image, np.array([8.0, 8.0])).repeated for k in range(5))
+
+
+@pytest.mark.parametrize('side', ['left', 'bottom'])
+def test_static_parts_are_found_and_masked(side):
+    static = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    if side == 'left':
+        static[:, : WIDTH // 4] = True
+    else:
+        static[-HEIGHT // 4 :] = True
+    parts, before = StillParts(), None
+    for number, (place, image) in enumerate(walk(150, static)):
+        change = added(parts, number, image, np.zeros(2) if before is None else before - place)
+        assert not change.repeated
+        before = place
+    expected = static[:: HEIGHT // ROWS, :: WIDTH // COLUMNS]
+    # Cells without texture are not named; nothing is named elsewhere.
+    assert change.static[expected].mean() > 0.7
+    assert not change.static[~expected].any()
+    mask = still.free_of(change.static, WIDTH, HEIGHT)
+    assert (mask[static] == 0).mean() > 0.95
+    assert (mask > 0).mean() > 0.6
+    corners = find_corners(image, np.empty((0, 2)), 400, TrackingConfig(), mask)
+    assert len(corners) > 50
+    assert within(corners, mask).all()
+    tracker = make_tracker(TrackingConfig())
+    tracker.start(image)
+    tracker.allow(mask)
+    assert within(tracker.track(image).points2, mask).all()
+
+
+def test_static_parts_are_forgotten_when_they_move_again():
+    static = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    static[:, :80] = True
+    parts, before = StillParts(), None
+    for number, (place, image) in enumerate([*walk(150, static), *walk(160, seed=4)]):
+        motion = np.zeros(2) if before is None or number == 150 else before - place
+        change = added(parts, number, image, motion)
+        before = place
+    assert not change.static.any()
