@@ -36,9 +36,9 @@ _WIDTH = 160
 # Least motion [px of the reduced image] that the rotation has to make in an informative cell. Less
 # motion changes the image by no more than its noise. [derived: a change of half the gradient]
 _LEAST_MOTION = 0.5
-# Least change E of an informative cell [gray levels]. [derived: five times the noise of a mean of
-# 4 x 4 pixels with a noise of 1.6 gray levels]
-_LEAST_CHANGE = 2.0
+# Least change E of an informative cell [gray levels]. [derived: six times the noise of a mean of
+# 4 x 4 pixels with a noise of 2 gray levels]
+_LEAST_CHANGE = 3.0
 # Largest D of a still cell as a share of E. Cells that move as the rotation says have D / E of
 # about 1; repeated images that are compressed again have 0.02 to 0.15. [measured: walks in three
 # scenes, images with noise of 0.8 gray levels compressed again: see test_still.py]
