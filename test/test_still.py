@@ -4,8 +4,23 @@ import cv2
 import numpy as np
 import pytest
 
+from rs_relpose_lab.field import defects
+from rs_relpose_lab.field.recording import base_recording, write_recording
+from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.scene import make_texture
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig
+from rs_relpose_ros.offline.replay import replay_into
+from rs_relpose_ros.pipeline import findings_text
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    Code,
+    Finding,
+    FindingState,
+    Why,
+    worst_of,
+)
 from rs_relpose_ros.tracking import still
 from rs_relpose_ros.tracking.features import find_corners, make_tracker, within
 from rs_relpose_ros.tracking.still import COLUMNS, ROWS, StillParts
@@ -110,3 +125,54 @@ def test_static_parts_are_forgotten_when_they_move_again():
         change = added(parts, number, image, motion)
         before = place
     assert not change.static.any()
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    """A walk of a small camera, in memory."""
+    config = SimulationConfig(
+        seed=78, duration=2.0, width=320, height=240, fx=225.0, plan='walk:2', pixel_noise=0.5
+    )
+    return base_recording(config, tmp_path_factory.mktemp('still') / 'walk')
+
+
+def replayed(recording, folder):
+    """Health and the pairs with a pose of a replay."""
+    parameters = read_parameters(write_recording(recording, folder / 'bag'))
+    pairs = []
+    with open_bag(folder / 'bag') as bag:
+        outcome = replay_into(
+            folder / 'out',
+            bag,
+            bag.find_topics(),
+            parameters,
+            pictures=False,
+            on_pair=lambda pair: pairs.append(pair) if pair.pose else None,
+        )
+    return outcome.health, pairs
+
+
+def test_repeated_images_are_reported_and_not_used(recording, tmp_path):
+    health, pairs = replayed(defects.repeated_images(recording, 3, 0.8), tmp_path)
+    found = {finding.code: finding for finding in health.findings}
+    measured = found[Code.REPEATED_IMAGES].evidence.measured
+    assert 12 <= measured['repeated'] <= 20
+    assert 'repeat the one before' in findings_text.line(found[Code.REPEATED_IMAGES])
+    stamps = {shot.stamp_ns for shot in recording.shots[2::3]}
+    assert pairs
+    assert sum(pair.stamp_ns in stamps for pair in pairs) <= 1  # where the camera hardly turned
+
+
+def test_an_intact_walk_has_neither_finding(recording, tmp_path):
+    health, pairs = replayed(recording, tmp_path)
+    assert pairs
+    codes = {finding.code for finding in health.findings}
+    assert codes.isdisjoint({Code.REPEATED_IMAGES, Code.STATIC_REGION})
+
+
+def test_the_first_finding_of_a_static_part_replaces_what_it_spoiled():
+    wrong = Finding(Code.GYRO_UNIT, FindingState.WRONG, Why.GROSS)
+    static = Finding(Code.STATIC_REGION, FindingState.SUSPECT, Why.STILL)
+    assert worst_of(Assessment((wrong,)), Assessment((static,))) == Assessment((static,))
+    later = worst_of(Assessment((static,)), Assessment((wrong, static)))
+    assert {finding.code for finding in later.findings} == {Code.STATIC_REGION, Code.GYRO_UNIT}

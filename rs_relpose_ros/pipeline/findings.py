@@ -51,6 +51,8 @@ class Code(str, Enum):
     IMAGE_GEOMETRY = 'image_geometry'
     ACCEL_AXES = 'accel_axes'
     ACCEL_SCALE = 'accel_scale'
+    REPEATED_IMAGES = 'repeated_images'
+    STATIC_REGION = 'static_region'
     # Properties of a recording: `is_property`.
     TOPICS = 'topics'
     PARAMETERS = 'parameters'
@@ -93,6 +95,7 @@ class Why(str, Enum):
     OPPOSITE = 'opposite'  # the opposite sign fits
     NO_SPECIFIC_FORCE = 'no_specific_force'
     RECTIFIED = 'rectified'
+    STILL = 'still'  # images or parts of them, though the camera turns
     # Gross errors: `is_gross`.
     GROSS = 'gross'
     LEFT_HANDED = 'left_handed'
@@ -181,6 +184,11 @@ class Assessment:
         )
 
     @property
+    def masks(self) -> bool:
+        """Whether a part of the image is masked, which spoiled what was found before."""
+        return any(finding.code is Code.STATIC_REGION for finding in self.findings)
+
+    @property
     def is_gross(self) -> bool:
         """Whether the worst finding is a gross error."""
         return self.state is FindingState.WRONG and self.faults[0].why.is_gross
@@ -191,7 +199,7 @@ NOT_EVALUATED = Assessment(())
 
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
     """The worse or later finding of each quantity; without traces of a gross error found later."""
-    traces = now.is_gross and not before.is_gross
+    traces = (now.is_gross and not before.is_gross) or (now.masks and not before.masks)
     found = {} if traces else {finding.code: finding for finding in before.findings}
     # What was observable once is known.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)

@@ -298,7 +298,29 @@ def _contradicting_accelerometer(finding: Finding) -> Text:
     )
 
 
+def _repeated_images(finding: Finding) -> Text:
+    measured = finding.evidence.measured
+    return Text(
+        f'{measured["repeated"]} of the last {measured["images"]} images repeat the one before '
+        'though the camera turns: they are not used',
+        'have the driver publish each image once',
+    )
+
+
+def _static_region(finding: Finding) -> Text:
+    measured = finding.evidence.measured
+    (left, right), (top, bottom) = measured['columns'], measured['rows']
+    return Text(
+        f'{100.0 * measured["share"]:.0f} % of the image do not move with the scene (within '
+        f'columns {left} to {right}, rows {top} to {bottom}): this part is masked',
+        'if it is a caption, a dirty lens, the hood or the interior of a vehicle, nothing has to '
+        'be done; poses come from the rest of the image',
+    )
+
+
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
+    (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
+    (Code.STATIC_REGION, Why.STILL): _static_region,
     (Code.READOUT_DIRECTION, Why.OFF): _direction_off,
     (Code.READOUT_DIRECTION, Why.BY_CALIBRATION): _direction_by_calibration,
     (Code.GYRO_UNIT, Why.GROSS): _other_unit,

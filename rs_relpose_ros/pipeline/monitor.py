@@ -46,6 +46,7 @@ class ConsistencyMonitor:
         self._likely = np.zeros(LIVE.size)  # about which pairs are linearised
         self._undetermined: Array | None = None  # by the pairs before
         self._gross: tuple[Finding, ...] = ()
+        self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
@@ -144,8 +145,9 @@ class ConsistencyMonitor:
         self._wrong_configuration = bool(self.health.faults)
         if self._wrong_configuration:
             self.acceleration.clear()
-        if (finding := self.acceleration.finding()) is not None:
-            self.health = Assessment((*self.health.findings, finding))
+        also = self.acceleration.finding()
+        also_found = () if also is None else (also,)
+        self.health = Assessment((*self.health.findings, *also_found, *self.image_findings))
 
     def _deviation(self) -> Array:
         """(K,) from the active values, of all inconsistent quantities."""

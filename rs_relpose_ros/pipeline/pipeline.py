@@ -22,7 +22,7 @@ from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
-from rs_relpose_ros.imu.integration import ImuSlice, rotation_sensitivity
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, rotation_sensitivity
 from rs_relpose_ros.pipeline import findings, pair
 from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
@@ -32,6 +32,7 @@ from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
 from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking.features import make_tracker, Tracker
+from rs_relpose_ros.tracking.images import Image
 
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
 # compared with the gyro.
@@ -92,7 +93,7 @@ class Pipeline(Processor[PairResult]):
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
         self._monitor = ConsistencyMonitor()
-        self.still = StillView()
+        self._still = StillView()
         self._sensor: Sensor | None = None
         self._readout = 0.0  # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
@@ -128,15 +129,14 @@ class Pipeline(Processor[PairResult]):
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if history is None or previous is None or step is None:
             self._tracker.start(frame.image)
-            self.still.start(frame.stamp_ns, frame.image)
+            self._still.start(frame.stamp_ns, frame.image)
             self._restart_from(frame)
             return None
-        new = self.still.imu_of_new(frame.stamp_ns, frame.image, frame.imu, previous.imu, sensor)
+        new = self._new_image(frame.stamp_ns, frame.image, frame.imu, previous.imu, sensor)
         if new is None:
             return None
         frame.imu_data, step = new, new.since_previous
         assert step is not None
-        self._tracker.allow(self.still.allowed(*frame.image.shape))
         predicted = self._predicted(previous.imu.motion, frame.imu.motion, step.rotation, sensor)
         passed = seconds_between(previous.stamp_ns, frame.stamp_ns)
         matches = self._tracker.track(frame.image, predicted, passed)
@@ -172,6 +172,20 @@ class Pipeline(Processor[PairResult]):
         self._restart_from(frame)
         unmatched = result.pose.status is Status.TOO_FEW_MATCHES
         return None if unmatched and self._is_repeated(frame.stamp_ns) else result
+
+    def _new_image(
+        self, stamp_ns: int, image: Image, imu: FrameImu, previous: FrameImu, sensor: Sensor
+    ) -> FrameImu | None:
+        """IMU data of an image since the last new image; None if it repeats that image."""
+        still = self._still
+        masked = still.static.any()
+        imu_of_new = still.imu_of_new(stamp_ns, image, imu, previous, sensor)
+        if still.static.any() and not masked:
+            # What was found with the static part in view is no evidence.
+            self._monitor = ConsistencyMonitor()
+        self._monitor.image_findings = still.findings()
+        self._tracker.allow(still.allowed())
+        return imu_of_new
 
     def _sensor_of(self, intrinsics: Intrinsics, parameters: Parameters) -> Sensor:
         """The sensor of the next frame; everything restarts with other intrinsics."""

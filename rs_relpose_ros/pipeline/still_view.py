@@ -4,24 +4,39 @@
 gyro of the images that are skipped.
 """
 
+from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
+from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.tracking.images import Image
-from rs_relpose_ros.tracking.still import cell_centres, Flags, free_of, StillParts
+from rs_relpose_ros.tracking.still import (
+    cell_centres,
+    COLUMNS,
+    Flags,
+    free_of,
+    ROWS,
+    StillParts,
+)
+
+# Number of images of which the repeated ones are counted, and number of repeated ones that are
+# reported. One or two repeated images are no habit of a driver. [chosen: 20 s at 30 Hz; 3 to 10]
+_COUNTED = 600
+_REPORTED = 3
 
 
 class StillView:
     """Follows the frames of a camera in the order of time."""
 
     def __init__(self) -> None:
-        self.repeated = 0  # number of images that were not new
-        self.static: Flags | None = None  # cells (ROWS, COLUMNS) that do not move
+        self.static: Flags = np.zeros((ROWS, COLUMNS), dtype=bool)  # cells that do not move
+        self._repeated: deque[bool] = deque(maxlen=_COUNTED)  # of the last images
+        self._size = (0, 0)  # (H, W) of the images
         self._parts = StillParts()
         self._skipped: ImuSlice | None = None  # from the last new image to the last image
 
@@ -30,6 +45,7 @@ class StillView:
         self._parts.reset()
         self._parts.add(stamp_ns, image, np.zeros(()))
         self._skipped = None
+        self._size = image.shape
 
     def imu_of_new(
         self, stamp_ns: int, image: Image, imu: FrameImu, previous: FrameImu, sensor: Sensor
@@ -42,18 +58,43 @@ class StillView:
         imu = replace(imu, since_previous=since)
         change = self._parts.add(stamp_ns, image, _motion_of_cells(previous, imu, sensor))
         self.static = change.static
+        self._repeated.append(change.repeated)
         if change.repeated:
-            self.repeated += 1
             self._skipped = since
             return None
         self._skipped = None
         return imu
 
-    def allowed(self, height: int, width: int) -> NDArray[np.uint8] | None:
+    def allowed(self) -> Image | None:
         """Mask (H, W) of the image that is 0 in static parts; None where nothing is static."""
-        if self.static is None or not self.static.any():
-            return None
-        return free_of(self.static, width, height)
+        height, width = self._size
+        return free_of(self.static, width, height) if self.static.any() else None
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings on repeated images and on static parts."""
+        found = []
+        repeated = sum(self._repeated)
+        if repeated >= _REPORTED:
+            measured = {'repeated': repeated, 'images': len(self._repeated)}
+            found.append(_still(Code.REPEATED_IMAGES, measured))
+        if self.static.any():
+            found.append(_still(Code.STATIC_REGION, self._extent()))
+        return tuple(found)
+
+    def _extent(self) -> dict[str, Any]:
+        """Share of the image that is static, and the rows and columns [px] that contain it."""
+        height, width = self._size
+        rows = np.flatnonzero(self.static.any(axis=1))
+        columns = np.flatnonzero(self.static.any(axis=0))
+        return {
+            'share': float(self.static.mean()),
+            'rows': [round(height * k / ROWS) for k in (rows[0], rows[-1] + 1)],
+            'columns': [round(width * k / COLUMNS) for k in (columns[0], columns[-1] + 1)],
+        }
+
+
+def _still(code: Code, measured: dict[str, Any]) -> Finding:
+    return Finding(code, FindingState.SUSPECT, Why.STILL, evidence=Evidence(measured=measured))
 
 
 def _motion_of_cells(previous: FrameImu, current: FrameImu, sensor: Sensor) -> Array:

@@ -146,10 +146,10 @@ def _compared(
         borderMode=cv2.BORDER_REFLECT,
     )
     expected = _cell_means(np.abs(moved - before))
-    seen = _cell_means(np.abs(now - before))
+    changed = _cell_means(np.abs(now - before))
     turned = np.linalg.norm(field, axis=2) >= _LEAST_MOTION
     informative = known & turned & (expected >= _LEAST_CHANGE)
-    return np.asarray(informative), np.asarray(seen < _STILL * expected)
+    return np.asarray(informative), np.asarray(changed < _STILL * expected)
 
 
 def _cell_means(values: NDArray[np.float32]) -> Array:
