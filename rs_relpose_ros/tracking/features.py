@@ -118,7 +118,7 @@ def feature_rows(config: TrackingConfig, height: int) -> tuple[float, float]:
     return (first, last) if last > 0.0 else (first, height - 1.0)
 
 
-def within(points: Array, allowed: Image | None) -> NDArray[np.bool_]:
+def within(points: Array, allowed: Image | None) -> Flags:
     """Mask (N,) of points (N, 2) of an image that lie where `allowed` (H, W) is not zero."""
     if allowed is None:
         return np.ones(len(points), dtype=bool)
@@ -128,7 +128,7 @@ def within(points: Array, allowed: Image | None) -> NDArray[np.bool_]:
     return np.asarray(inside & (allowed[v.clip(0, height - 1), u.clip(0, width - 1)] > 0))
 
 
-def keep_apart(points: Array, radius: float) -> NDArray[np.bool_]:
+def keep_apart(points: Array, radius: float) -> Flags:
     """Mask (N,) of points (N, 2) that are not within `radius` of one before them."""
     kept = np.ones(len(points), dtype=bool)
     if len(points) > 1:

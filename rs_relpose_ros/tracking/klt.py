@@ -404,7 +404,7 @@ class KltTracker:
         new = features.find_corners(
             self._current,
             kept,
-            self._config.max_features - len(kept),
+            wanted,
             self._config,
             self._allowed,
         )
