@@ -702,6 +702,7 @@ def test_bad_usage(arguments, message, tmp_path, refused):
 
 
 def test_steps_between_stamps():
-    stamps = Stamps([k * 5 * MS + (100 * MS if k > 10_000 else 0) for k in range(20_000)], [0.0])
+    times = [k * 5 * MS + (100 * MS if k > 10_000 else 0) for k in range(20_000)]
+    stamps = Stamps(times, times)
     assert stamps.interval == pytest.approx(0.005) and stamps.count == 20_000
     assert (stamps.forwards > 0.05).sum() == 1 and stamps.longest == pytest.approx(0.105)

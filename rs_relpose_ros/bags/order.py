@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 Times = NDArray[np.int64]
 
 # Messages that count as a clock that was set back. Fewer may have been late, or one of them may
-# have a wrong stamp. [chosen: a camera of 10 Hz is then recognised within half a second]
-_FEWEST_AFTER_RESET = 5
+# have a wrong stamp. [chosen: the clock of a camera of 30 Hz is then recognised from 0.1 s on]
+_FEWEST_AFTER_RESET = 3
 # Number of messages in the time that both sides of a backward step cover, in relation to the
 # number at the rate of the sensor: 1 if late messages fill a gap, 2 if a clock covers this time
 # again. [derived: the mean of both]
@@ -35,28 +35,36 @@ def clock_runs(stamps: Times) -> NDArray[np.int64]:
     runs = np.zeros(len(stamps), dtype=np.int64)
     if len(stamps) < 2 * _FEWEST_AFTER_RESET:
         return runs
-    largest_before = np.maximum.accumulate(stamps)[:-1]
-    period = max(float(np.median(np.abs(np.diff(stamps)))), 1.0)
+    period = max(float(np.median(np.diff(np.sort(stamps)))), 1.0)
     begin = 0  # of the run
+    largest = np.maximum.accumulate(stamps)
     for step in np.flatnonzero(np.diff(stamps) < 0) + 1:
-        top = largest_before[step - 1] if begin == 0 else stamps[begin:step].max()
-        if stamps[step] < top and _is_reset(stamps[begin:step], stamps[step:], top, period):
-            runs[step:] += 1
+        top = largest[step - 1]
+        if _is_reset(stamps[begin:step], stamps[step:], top, period):
             begin = int(step)
+            runs[begin:] += 1
+            largest[begin:] = np.maximum.accumulate(stamps[begin:])
     return runs
 
 
 def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
-    """Whether a clock was set back, and messages were not merely late."""
+    """Whether a clock was set back, and messages were not merely late.
+
+    `before` and `after` the step (N,) and (M,) [ns]; `top` is the largest stamp before it.
+    """
+    if len(after) < _FEWEST_AFTER_RESET or np.any(after[:_FEWEST_AFTER_RESET] > top):
+        return False
     passing = np.flatnonzero(after > top)
-    returns = int(passing[0]) if len(passing) else len(after)
+    until = int(passing[0]) if len(passing) else len(after)
+    covering = int(np.count_nonzero(after[:until] >= after[0]))
     above = int(np.count_nonzero(before >= after[0]))
-    if min(above, returns) < _FEWEST_AFTER_RESET:
+    if above < _FEWEST_AFTER_RESET:
         return False
     expected = (top - int(after[0])) / period + 1.0
-    covered_twice = above + returns > _COVERED_TWICE * expected + 1.0
-    never_returns = not len(passing) and above + returns < 0.5 * expected
-    return covered_twice or never_returns
+    covered_twice = above + covering > _COVERED_TWICE * expected
+    # Late messages fill a gap; after a jump over all that was recorded most of the time is empty.
+    never_passes = not len(passing) and above + covering < expected / _COVERED_TWICE
+    return covered_twice or never_passes
 
 
 def reading_order(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:

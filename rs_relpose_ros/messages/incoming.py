@@ -206,13 +206,13 @@ SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
 def sensor_messages(
     bag: Any, topics: Any, roles: Collection[Role] = SENSOR_ROLES
 ) -> Iterator[tuple[Role, Any]]:
-    """Messages of a `Bag` with one of the roles, in bag order; `topics`: `SensorTopics`."""
+    """Messages of a `Bag` with one of the roles, by stamp; `topics`: `SensorTopics`."""
     found = {
         topic.name: (role, topic)
         for role in reversed(Role)
         if role in roles and (topic := getattr(topics, role.value)) is not None
     }
-    for message in bag.messages([topic for _, topic in found.values()]):
+    for message in bag.messages([topic for _, topic in found.values()], by_stamp=True):
         yield found[message.topic][0], message
 
 

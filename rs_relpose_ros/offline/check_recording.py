@@ -54,9 +54,12 @@ _MOST_ENCODINGS = 20
 class Stamps:
     """Stamps (N,) of a topic [ns], in the order of recording, and how much later [s] that was."""
 
-    def __init__(self, stamps_ns: Sequence[int], delays: Sequence[float]) -> None:
-        self.ns = np.array(stamps_ns, dtype=np.int64)
+    def __init__(self, stamps_ns: Sequence[int], recorded_ns: Sequence[int]) -> None:
+        recorded = np.array(recorded_ns, dtype=np.int64)
+        order = np.argsort(recorded, kind='stable')
+        self.ns = np.array(stamps_ns, dtype=np.int64)[order]
         self.count = len(self.ns)
+        delays = (recorded[order] - self.ns) * 1e-9
         self.delay = float(np.median(delays)) if self.count else math.nan
         self.duration = int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0  # [s]
         self.steps = np.diff(self.ns) * 1e-9  # (N - 1,) [s]; some may be zero or negative
@@ -78,7 +81,7 @@ class Scan:
     def __init__(self, images: int, configured: IntrinsicsConfig) -> None:
         self.configured = configured
         self._every = max(images // _DECODED, 1)
-        self._stamps = {role: (array('q'), array('d')) for role in (Role.IMAGE, Role.IMU)}
+        self._stamps = {role: (array('q'), array('q')) for role in (Role.IMAGE, Role.IMU)}
         self._rates, self._forces = array('d'), array('d')
         self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
         self.orientations = 0  # of the IMU, with a covariance
@@ -95,9 +98,9 @@ class Scan:
         try:
             data = PARTS[role].read(message.message)
             if role in self._stamps:
-                stamps_ns, delays = self._stamps[role]
+                stamps_ns, recorded_ns = self._stamps[role]
                 stamps_ns.append(data.stamp_ns)
-                delays.append((message.bag_time_ns - data.stamp_ns) * 1e-9)
+                recorded_ns.append(message.bag_time_ns)
             if role is Role.IMAGE:
                 self._add_image(data)
             elif role is not Role.CAMERA_INFO:

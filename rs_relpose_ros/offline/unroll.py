@@ -76,7 +76,7 @@ class Unrolling:
             for role in (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
             if (topic := getattr(self._topics, role.value)) is not None
         }
-        for raw in self._bag.raw_messages(topics):
+        for raw in self._bag.raw_messages(topics, by_stamp=True):
             role = roles.get((raw.topic, raw.msgtype))
             if role not in (Role.IMAGE, Role.CAMERA_INFO):
                 self.copied += 1
