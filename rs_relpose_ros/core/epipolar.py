@@ -56,7 +56,8 @@ class Residual(NamedTuple):
 @inlined_kernel
 def residual(first: View, second: View, baseline: Vector) -> Residual:
     """Evaluate the residual of a match."""
-    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)  # of e
+    # Derivatives of e by the two rays.
+    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)
     e = dot(by_ray_1, first.ray)
     q1, q2 = dot(by_ray_1, first.by_u), dot(by_ray_1, first.by_v)
     q3, q4 = dot(by_ray_2, second.by_u), dot(by_ray_2, second.by_v)
@@ -94,7 +95,8 @@ def by_rays(first: View, second: View, baseline: Vector, at: Residual) -> tuple[
 
     A change of the lens, for example, changes all six vectors.
     """
-    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)  # of e
+    # Derivatives of e by the two rays.
+    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)
     c1, c2, c3, c4 = at.factors
     return (
         View(
@@ -111,16 +113,19 @@ class Derivatives(NamedTuple):
 
     residuals: Array  # (N,) [px]
     by_baseline: Array  # (N, 3)
-    by_rotation: Array  # (N, 2, 3) of each image, by a rotation vector on the left
-    by_rays: Array  # (N, 2, 3, 3) of each image, by the ray and by its derivatives by u and v
+    # (N, 2, 3) by a rotation vector on the left of all vectors of image 1, and of image 2.
+    by_rotation: Array
+    # (N, 2, 3, 3) by the ray of each image, and by the derivatives of this ray by u and by v.
+    by_rays: Array
 
 
 @kernel
 def derivatives(views: Array, baselines: Array) -> Derivatives:
     """Residuals and derivatives of matches whose vectors are in one frame.
 
-    `views` (N, 2, 3, 3): of each image the ray, its derivative by u and its derivative by v.
-    `baselines` (N, 3): from the place of the camera at the first row to that at the second row.
+    `views` (N, 2, 3, 3) hold the ray of each image, its derivative by u and its derivative by v.
+    `baselines` (N, 3) lead from the place of the camera at the row of image 1 to its place at the
+    row of image 2.
     """
     n = len(views)
     out = Derivatives(np.empty(n), np.empty((n, 3)), np.empty((n, 2, 3)), np.empty((n, 2, 3, 3)))

@@ -56,8 +56,8 @@ SIGMA_PER_MEDIAN = 1.4826
 def robust_scale(residuals: Array, floor: float, freedom: float) -> float:
     """Standard deviation of residuals (N,), free of NaN, by the median of their absolute values.
 
-    `freedom`: number of unknowns that were fitted to the residuals and made them smaller. The
-    result is at least `floor`.
+    `freedom` is the number of unknowns that were fitted to the residuals and made them smaller.
+    The result is at least `floor`.
     """
     count = len(residuals)
     scale = SIGMA_PER_MEDIAN * so3.median(np.abs(residuals))
@@ -73,12 +73,12 @@ WORSE = 3.0
 # Share of worse matches before the first iteration. Six iterations forget it.
 # [chosen: any value in 0.02..0.3 would do]
 FIRST_SHARE = 0.1
-# Number of matches as which the configured noise counts. More of them would hide noise that
-# differs from the configured one; fewer would make the noise of a dozen matches arbitrary.
+# The configured noise counts as much as so many matches. More of them would hide noise that
+# differs from the configured noise; fewer would make the noise of a dozen matches arbitrary.
 # [chosen: few against the hundred matches of a pair]
 PRIOR_MATCHES = 10.0
-# Number of good matches that are added to the observed ones when the share of worse ones is
-# estimated: it keeps the share small where only few matches are known.
+# So many good matches are added to the observed matches when the share of worse matches is
+# estimated. They keep the share small where a pair has few matches.
 # [chosen: few against the hundred matches of a pair]
 LIKELY_GOOD = 20.0
 # Iterations of expectation maximisation: one pass over the matches each.

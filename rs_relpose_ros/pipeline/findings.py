@@ -1,8 +1,7 @@
 """Findings of the consistency monitor and of `check` as objects, and the quantities they cover.
 
-A finding has codes and numbers; `findings_text` makes its text where it leaves the process.
-
-Deviations are values of the selection `LIVE` of `core.deviations`.
+A finding has codes and numbers; `findings_text` makes its text where it leaves the process. The
+deviations of the quantities are values of the selection `LIVE` of `core.deviations`.
 """
 
 from collections.abc import Mapping
@@ -16,12 +15,16 @@ from numpy.typing import ArrayLike
 
 from rs_relpose_ros.core.deviations import LIVE
 
-# Largest deviations [s] that tracking applies.
-LARGEST_OFFSET, LARGEST_READOUT = 0.05, 0.01
+# Largest change of the time offset that tracking applies [s]. A larger one means that stamps mark
+# another event, which a human should know. [chosen: the prior sigma of the offset]
+LARGEST_OFFSET = 0.05
+# Largest change of the readout time that tracking applies [s]. A larger one means another mode of
+# the camera. [chosen: a third of a usual readout time]
+LARGEST_READOUT = 0.01
 
 
 class FindingState(str, Enum):
-    """Consistency of a quantity with the data; from good to bad."""
+    """Consistency of a quantity with the data, from good to bad."""
 
     OK = 'ok'
     UNKNOWN = 'unknown'  # not observable, or not measured
@@ -114,12 +117,14 @@ class Why(str, Enum):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a finding is based on; None if it does not apply."""
+    """What a finding is based on; a value is None if it does not apply."""
 
-    sigmas: float | None = None  # certainty of the deviation
-    shift: float | None = None  # of the pose by the deviation, in its sigmas
+    sigmas: float | None = None  # size of the deviation, in its own sigmas
+    shift: float | None = None  # how far the deviation moves a pose, in sigmas of the pose
     pairs: int | None = None  # number of pairs
-    log_likelihood: float | None = None  # of the configuration, against no information
+    # How much better the configuration explains the data than no knowledge does, as the logarithm
+    # of the ratio of likelihoods.
+    log_likelihood: float | None = None
     # Numbers of this cause alone, SI units unless the key names another one.
     measured: Mapping[str, Any] = field(default_factory=dict)
 
@@ -132,9 +137,9 @@ class Finding:
     state: FindingState
     why: Why
     configured: tuple[float, ...] = ()  # values of a parameter as they are applied
-    estimated: tuple[float, ...] = ()  # empty if they are not observable
-    sigma: float | None = None  # of the estimated value `component`
-    unit: str = ''  # of the values and of sigma
+    estimated: tuple[float, ...] = ()  # estimated values; empty if they are not observable
+    sigma: float | None = None  # 1 sigma of the estimated value with the index `component`
+    unit: str = ''  # unit of the values and of sigma
     component: int = 0  # index of the value that deviates most
     evidence: Evidence = field(default_factory=Evidence)
     candidates: tuple[Code, ...] = ()  # causes that fit as well, this one included
@@ -194,14 +199,19 @@ class Assessment:
         return self.state is FindingState.WRONG and self.faults[0].why.is_gross
 
 
+# Before the first pair.
 NOT_EVALUATED = Assessment(())
 
 
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
-    """The worse or later finding of each quantity; without traces of a gross error found later."""
+    """The worse finding of each quantity, and of two equally bad ones the later.
+
+    If `now` has a gross error or masks a part of the image, and `before` did not, the earlier
+    findings were traces of it and are dropped.
+    """
     traces = (now.is_gross and not before.is_gross) or (now.masks and not before.masks)
     found = {} if traces else {finding.code: finding for finding in before.findings}
-    # What was observable once is known.
+    # A quantity that was observable once is not unknown any more.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:
         if order.index(found.setdefault(one.code, one).state) <= order.index(one.state):
@@ -210,7 +220,7 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
 
 
 def rounded(values: ArrayLike, digits: int = 5) -> list[float]:
-    """Values (K,) to set or to show; never -0.0."""
+    """Round values (K,) to set or to show; none of them is -0.0."""
     return [round(float(value), digits) + 0.0 for value in np.atleast_1d(values)]
 
 
@@ -218,10 +228,12 @@ class Quantity(NamedTuple):
     """A parameter of camera or IMU that images and gyro determine."""
 
     code: Code
-    entry: str  # of the deviations `LIVE`
-    observable: float  # largest sigma of an observable deviation
-    unit: str  # of a finding; deviations are in rad instead of deg, relative instead of px
-    tracking: str = ''  # parameter that has it tracked
+    entry: str  # name of its deviation in `LIVE`
+    observable: float  # largest sigma with which the deviation counts as observable
+    # Unit of the values of a finding. Deviations are in rad where this is deg, and relative where
+    # this is px.
+    unit: str
+    tracking: str = ''  # name of the parameter that lets the node track the quantity
     reach: float = 0.0  # largest deviation that tracking applies
 
     @property
@@ -242,6 +254,7 @@ class Quantity(NamedTuple):
         return math.radians(apart) if self.unit == 'deg' else apart
 
 
+# The quantities in the order of messages.
 QUANTITIES = (
     Quantity(Code.AXES, 'axes', math.radians(1.0), 'deg'),
     Quantity(Code.TIME_OFFSET, 'time_offset', 4e-3, 's', 'track_time_offset', LARGEST_OFFSET),
@@ -251,4 +264,5 @@ QUANTITIES = (
     Quantity(Code.FOCAL_LENGTH, 'focal_log', 0.04, 'px'),
     Quantity(Code.DISTORTION, 'distortion', 0.05, ''),
 )
+# The same by code.
 BY_CODE = {quantity.code: quantity for quantity in QUANTITIES}
