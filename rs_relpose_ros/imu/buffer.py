@@ -26,6 +26,19 @@ Stamps = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 
+# A step between samples of more than this many times the usual one: a sample may still arrive.
+# [derived: halfway between one step and two]
+_LATE_STEP = 1.5
+# Duration of the samples [ns] by which the accelerometer is tested. Within a shorter one the mean
+# force contains the acceleration of a step. [derived: a walk has two steps a second]
+_TESTED_NS = 1_000_000_000
+# Samples for which a series has room at first, and by which it grows. [chosen: a second]
+_ROOM = 256
+# Old samples are removed when the oldest has this part of the buffer's length more than it: a
+# search for each sample would cost more than the memory. [chosen: a tenth of the memory]
+_EXCESS = 10
+
+
 class Coverage(Enum):
     """Whether the samples cover an interval."""
 
@@ -39,8 +52,8 @@ class Series:
 
     def __init__(self, gap_ns: int, width: int = 3) -> None:
         self._gap_ns = gap_ns
-        self._stamps = np.empty(256, dtype=np.int64)
-        self._values = np.empty((256, width))
+        self._stamps = np.empty(_ROOM, dtype=np.int64)
+        self._values = np.empty((_ROOM, width))
         self._start = self._end = 0
 
     @property
@@ -69,7 +82,7 @@ class Series:
             if stamps[position] == stamp_ns:
                 return False
         if self._end == len(self._stamps):
-            more = max(256, len(stamps))
+            more = max(_ROOM, len(stamps))
             self._values = np.concatenate([self.values, np.empty((more, self._values.shape[1]))])
             self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
             self._start = 0
@@ -84,7 +97,7 @@ class Series:
 
     def prune(self, before_ns: int) -> None:
         """Remove samples before `before_ns`, except the last of them, for interpolation."""
-        keep = int(np.searchsorted(self.stamps, before_ns, side='right')) - 1
+        keep = self.number_until(before_ns) - 1
         if keep > 0:
             self._start += keep
 
@@ -94,35 +107,32 @@ class Series:
             return None
         if start_ns == end_ns:
             return np.array([start_ns]), self._interpolated(start_ns)[None]
-        inside = slice(
-            int(self.stamps.searchsorted(start_ns, 'right')), int(self.stamps.searchsorted(end_ns))
-        )
-        return (
-            np.concatenate([[start_ns], self.stamps[inside], [end_ns]]),
-            np.concatenate(
-                [
-                    self._interpolated(start_ns)[None],
-                    self.values[inside],
-                    self._interpolated(end_ns)[None],
-                ]
-            ),
-        )
+        first = self.number_until(start_ns)
+        last = int(self.stamps.searchsorted(end_ns))
+        stamps = np.concatenate([[start_ns], self.stamps[first:last], [end_ns]])
+        begin = self._interpolated(start_ns)[None]
+        end = self._interpolated(end_ns)[None]
+        return stamps, np.concatenate([begin, self.values[first:last], end])
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps = self.stamps
-        values = self.values
         after = int(stamps.searchsorted(at_ns))
+        value = self.values[after]
         if stamps[after] == at_ns:
-            return values[after]
-        before = after - 1
-        fraction = (at_ns - stamps[before]) / (stamps[after] - stamps[before])
-        return np.asarray(values[before] + fraction * (values[after] - values[before]))
+            return value
+        before = self.values[after - 1]
+        step = stamps[after] - stamps[after - 1]
+        fraction = (at_ns - stamps[after - 1]) / step
+        return np.asarray(before + fraction * (value - before))
 
     def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
         """Stamps within an interval, and one on either side of it."""
-        stamps = self.stamps
-        first = max(int(stamps.searchsorted(start_ns, 'right')) - 1, 0)
-        return stamps[first : int(stamps.searchsorted(end_ns)) + 1]
+        first = max(self.number_until(start_ns) - 1, 0)
+        return self.stamps[first : int(self.stamps.searchsorted(end_ns)) + 1]
+
+    def number_until(self, at_ns: int) -> int:
+        """Number of samples up to a time, that time included."""
+        return int(self.stamps.searchsorted(at_ns, 'right'))
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
@@ -148,11 +158,16 @@ class ImuSample:
 
 
 # Bounds of the mean length of the specific force over some seconds, in standard gravities: no
-# carrier accelerates for so long. In units of g it is 1 m/s^2, in mg or feet too large.
+# carrier accelerates for so long. Within closer ones a running person would be refused; in units
+# of g the length is 1 m/s^2, in mg or feet too large. [chosen: a scale error of 30 %]
 _LIKELY_LENGTHS = (0.7, 1.4)
 # Three consecutive samples that are bit-equal on one axis, close to the largest value there, are
-# the end of the sensor's range, which is at least this many gravities.
+# the end of the sensor's range, which is at least this many gravities: at rest, samples of a
+# coarse sensor are equal, too. [chosen: the smallest range of a sensor is 2 g]
 _LEAST_RANGE = 1.5
+# Share of the largest value on an axis from which a sample may be the end of the range.
+# [chosen: calibrated sensors have the end of their range on each axis within rounding]
+_AT_THE_END = 0.999
 
 
 class ForceFault(str):
@@ -193,9 +208,8 @@ def force_fault(forces: Array) -> str:
     size = np.abs(forces)
     if size.max() < _LEAST_RANGE * STANDARD_GRAVITY:
         return ''
-    equal = (forces[1:] == forces[:-1]) & (
-        size[1:] >= np.maximum(0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY)
-    )
+    end = np.maximum(_AT_THE_END * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY)
+    equal = (forces[1:] == forces[:-1]) & (size[1:] >= end)
     clipped = (equal[1:] & equal[:-1]).any()
     return f'the accelerometer is clipped at {size.max():.3g} m/s^2' if clipped else ''
 
@@ -224,12 +238,6 @@ class ImuInterval(NamedTuple):
         )
         mean = np.einsum('kij,kj->i', rotations, self.forces) / len(self.forces)
         return np.asarray(rotations[-1].T @ mean)
-
-
-# A step between samples of more than this many times the usual one: a sample may still arrive.
-_LATE_STEP = 1.5
-# Duration of the samples by which the accelerometer is tested: longer than a step of a walk.
-_TESTED_NS = 1_000_000_000
 
 
 class ImuSamples:
@@ -342,8 +350,8 @@ class ImuBuffer(ImuSamples):
     def add(self, sample: ImuSample) -> bool:
         """Store a sample, or False for a duplicate; InputError if a value is not finite."""
         added = super().add(sample)
-        # Pruned when a tenth is too old: a search per sample would cost more than the memory.
-        if sample.stamp_ns - self._pruned_ns > self._keep_ns * 11 // 10:
+        excess = sample.stamp_ns - self._pruned_ns - self._keep_ns
+        if excess > self._keep_ns // _EXCESS:
             self._pruned_ns = sample.stamp_ns - self._keep_ns
             self.prune(self._pruned_ns)
         return added
@@ -383,14 +391,11 @@ class ImuBuffer(ImuSamples):
 
     def recent_forces(self, until_ns: int, duration_ns: int | None = None) -> Array:
         """Specific forces (K, 3) [m/s^2] up to a time, IMU frame."""
-        stamps = self.force.stamps
-        # Half of the buffer, which is there independently of the time of the query.
-        start_ns = until_ns - (self._keep_ns // 2 if duration_ns is None else duration_ns)
-        return self.force.values[
-            int(np.searchsorted(stamps, start_ns)) : int(
-                np.searchsorted(stamps, until_ns, side='right')
-            )
-        ]
+        if duration_ns is None:
+            # Half of the buffer is there, whenever it is asked for.
+            duration_ns = self._keep_ns // 2
+        first = int(self.force.stamps.searchsorted(until_ns - duration_ns))
+        return self.force.values[first : self.force.number_until(until_ns)]
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at a time, from samples up to it; to be called in the order of time."""
@@ -407,8 +412,8 @@ class ImuBuffer(ImuSamples):
     def gravity(self, at_ns: int) -> GravityEstimate | None:
         """Direction of gravity at a time that the gyro covers, from samples up to it, if any.
 
-        To be called in the order of time: before that of an earlier call, its estimate is
-        rotated back.
+        To be called in the order of time: for a time before an earlier call, the estimate of that
+        call is rotated back.
         """
         if self.config.gravity_filter == 'mean':
             estimate = filters.mean_gravity(self.recent_forces(at_ns, filters.MEAN_WINDOW_NS))
@@ -418,19 +423,19 @@ class ImuBuffer(ImuSamples):
             stamp_ns = self._filter.stamp_ns
             if estimate is not None and stamp_ns is not None:
                 estimate = self._propagated(estimate, stamp_ns, at_ns)
-        last = int(np.searchsorted(self._down.stamps, at_ns, side='right')) - 1
-        if last >= 0 and self.config.use_imu_orientation:
-            own_ns = int(self._down.stamps[last])
-            (*down, sigma) = self._down.values[last].tolist()
-            if (
-                at_ns - own_ns <= self._gap_ns
-                and (
-                    own := self._propagated(GravityEstimate(np.array(down), sigma), own_ns, at_ns)
-                )
-                is not None
-            ):
-                return filters.agreed_gravity(own, estimate)
-        return estimate
+        own = self._own_gravity(at_ns) if self.config.use_imu_orientation else None
+        return estimate if own is None else filters.agreed_gravity(own, estimate)
+
+    def _own_gravity(self, at_ns: int) -> GravityEstimate | None:
+        """Gravity by the last orientation that the IMU has computed, unless it is too old."""
+        last = self._down.number_until(at_ns) - 1
+        if last < 0:
+            return None
+        own_ns = int(self._down.stamps[last])
+        *down, sigma = self._down.values[last].tolist()
+        if at_ns - own_ns > self._gap_ns:
+            return None
+        return self._propagated(GravityEstimate(np.array(down), sigma), own_ns, at_ns)
 
     def _propagated(
         self, estimate: GravityEstimate, from_ns: int, to_ns: int
@@ -446,16 +451,17 @@ class ImuBuffer(ImuSamples):
         """Filter the samples up to a time that were not filtered yet."""
         if until_ns <= self._filtered_ns:
             return
-        bounds = np.array([self._filtered_ns, until_ns])
-        first, last = np.searchsorted(self.gyro.stamps, bounds, side='right')
+        first = self.gyro.number_until(self._filtered_ns)
+        last = self.gyro.number_until(until_ns)
         if first < last:
             stamps = self.gyro.stamps[first:last]
             rates = self.gyro.values[first:last]
             # The latest specific forces not after these stamps; NaN if older than a gap.
             forces = np.full((len(stamps), 3), np.nan)
-            if len(self.force.stamps):
-                k = np.searchsorted(self.force.stamps, stamps, side='right') - 1
-                fresh = (k >= 0) & (stamps - self.force.stamps[k] <= self._gap_ns)
+            force_stamps = self.force.stamps
+            if len(force_stamps):
+                k = np.searchsorted(force_stamps, stamps, side='right') - 1
+                fresh = (k >= 0) & (stamps - force_stamps[k] <= self._gap_ns)
                 forces[fresh] = self.force.values[k[fresh]]
             self._bias.run(stamps, rates, forces)
             # With the configured bias only: the gravity filter estimates the rest.

@@ -31,6 +31,8 @@ from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, norm, rotated, STAN
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.jit import kernel, small_kernel
 
+Stamps = NDArray[np.int64]
+
 # -- Bias of the gyro, measured at rest -----------------------------------------------------------
 #
 # Samples are tested in windows of half a second. A window is at rest if gyro and accelerometer
@@ -41,18 +43,26 @@ from rs_relpose_ros.jit import kernel, small_kernel
 # `P_0` is the square of ``gyro_bias_sigma``. Of two consecutive windows at rest only the older one
 # is used: the newer one may contain the beginning of a motion.
 
-# Time in which the variance of a measured bias grows back to `gyro_bias_sigma` squared [s].
+# Time in which the variance of a measured bias grows back to `gyro_bias_sigma` squared [s]. With
+# less, a rest is soon forgotten; with more, the temperature moves the bias away from the estimate.
+# [chosen: a MEMS gyro warms up in some ten minutes]
 BIAS_MEMORY = 600.0
 
+# Length of a window [ns]. A shorter one mistakes the turning point of a motion for rest, a longer
+# one misses short rests. [chosen: a hand does not keep still for half a second]
 _WINDOW_NS = 500_000_000
+# Fewest samples of a window, for its standard deviation. [chosen: IMUs have 50 in it at 100 Hz]
 _LEAST_SAMPLES = 10
-# Largest standard deviation at rest, per axis [rad/s], [m/s^2]: three times that of a MEMS IMU on
-# a table, a third of that of a hand that tries to be still.
+# Largest standard deviations at rest, per axis [rad/s], [m/s^2]. Above them the mean of a window
+# is a motion, and would be learnt as bias. [measured: three times the noise of a MEMS IMU on a
+# table, a third of a hand that tries to be still]
 _REST_RATE = 0.01
 _REST_FORCE = 0.1
-# Correlation time of the remaining motion at rest [s].
+# Correlation time of the remaining motion at rest [s]: samples within it count as one.
+# [chosen: tables and vehicles sway at some hertz]
 _SWAY_TIME = 0.1
 # Largest distance of the mean rate from the bias, in sigmas; beyond it is a slow rotation.
+# [derived: one of 16 000 windows of pure noise is left out]
 _GATE = 4.0
 
 
@@ -73,7 +83,7 @@ class GyroBias(NamedTuple):
 
 
 class _Rest(NamedTuple):
-    """A window at rest: its end, its mean rate and the variance of that."""
+    """A window at rest: its end, its mean rate and the variance of the mean."""
 
     end_ns: int
     mean: Array
@@ -81,7 +91,7 @@ class _Rest(NamedTuple):
 
 
 class BiasTracker:
-    """Causal estimate of the gyro's bias; its state depends on the samples alone."""
+    """Causal estimate of the gyro's bias, whose state depends on the samples alone."""
 
     def __init__(self, config: ImuConfig) -> None:
         self._gap_ns = to_nanoseconds(config.max_imu_gap)
@@ -92,13 +102,13 @@ class BiasTracker:
         self._variance = self._prior
         self._measured_ns = 0
         self._rest: _Rest | None = None
-        self._pending: tuple[NDArray[np.int64], Array, Array] = (
+        self._pending: tuple[Stamps, Array, Array] = (
             np.empty(0, dtype=np.int64),
             np.empty((0, 3)),
             np.empty((0, 3)),
         )
 
-    def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
+    def run(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
         """Process later samples: stamps (K,), rates [rad/s], forces [m/s^2], or NaN."""
         if not self._follow:
             return
@@ -118,7 +128,7 @@ class BiasTracker:
         """The bias at a time, from the windows up to now."""
         return GyroBias(self._bias, math.sqrt(self._variance_at(at_ns)))
 
-    def _evaluate(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
+    def _evaluate(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
         """Test one window; `stamps_ns` has one more, that of the sample after it."""
         before = self._rest
         self._rest = None
@@ -144,21 +154,27 @@ class BiasTracker:
         return min(self._variance + self._growth * passed, self._prior)
 
 
-# Error of gravity as measured by an accelerometer, scale and bias [m/s^2].
+# Error of gravity's length as an accelerometer measures it, scale and bias [m/s^2].
+# [derived: 3 %, as data sheets of MEMS accelerometers have it]
 LENGTH_SIGMA = 0.3
-# Mean acceleration along gravity over the correlation time [m/s^2]: smaller than its momentary
-# value, since the velocity is bounded.
+# Mean acceleration along gravity over the correlation time [m/s^2]. It is smaller than the
+# momentary one, since the velocity is bounded. [chosen: 0.06 m/s over the correlation time]
 _LENGTH_NOISE = 0.3
-# Growth of the variance of the length [m^2/s^5]: temperature.
+# Growth of the variance of the length [m^2/s^5]: temperature. [chosen: 0.1 m/s^2 in ten minutes]
 _LENGTH_GROWTH = 2e-5
+# Window of the mean specific force of the paper's estimate of gravity [ns]. [derived: the paper]
 MEAN_WINDOW_NS = 100_000_000
-# Correlation time of hand-held acceleration [s]: samples within it count as one measurement.
+# Correlation time of hand-held acceleration [s]: samples within it count as one measurement. With
+# less, the filter trusts a swing of the arm. [derived: a walk has two steps a second]
 _CORRELATION_TIME = 0.2
 # Averaging time of the residual [s]: acceleration that lasts longer biases the direction.
+# [derived: five correlation times, so that their mean is significant]
 _LASTING = 1.0
-# Least sigma of an orientation that the IMU computes, in motion [rad].
+# Least sigma of an orientation that the IMU computes, in motion [rad]: drivers publish the noise
+# of an IMU at rest. [chosen: 0.6 deg]
 _LEAST_OWN_SIGMA = 0.01
-# Largest distance of such a direction from the accelerometer's, in sigmas.
+# Largest distance of such a direction from the accelerometer's, in sigmas: beyond it the IMU means
+# another world frame. [derived: one of 3000 right ones is left out]
 _OWN_GATE = 4.0
 
 
@@ -193,7 +209,7 @@ class _State(NamedTuple):
 
 
 class GravityFilter:
-    """Causal filter of the direction of gravity; its state depends on the samples alone."""
+    """Causal filter of the direction of gravity, whose state depends on the samples alone."""
 
     def __init__(self, config: ImuConfig) -> None:
         self._config = config
@@ -224,7 +240,7 @@ class GravityFilter:
         self.stamp_ns: int | None = None
         self._rate = np.zeros(3)
 
-    def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
+    def run(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
         """Process samples as `BiasTracker.run`, but with the configured bias removed."""
         k = 0
         while k < len(stamps_ns):
@@ -280,7 +296,7 @@ class GravityFilter:
     def _begin(
         self,
         k: int,
-        stamps_ns: NDArray[np.int64],
+        stamps_ns: Stamps,
         rates: Array,
         forces: Array,
     ) -> int:
@@ -307,7 +323,7 @@ def _advance(
     noise: _Noise,
     stamp_ns: int,
     rate: Array,
-    stamps_ns: NDArray[np.int64],
+    stamps_ns: Stamps,
     rates: Array,
     forces: Array,
     gap_ns: int,
