@@ -6,7 +6,7 @@ Each error names the argument, what is legal, and what came.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -31,6 +31,7 @@ _LARGEST_COVARIANCE = 1e12
 # Shortest and longest time between two frames [s]: beyond them a unit was mistaken.
 # [chosen: a camera has 1e-4 s at least, and a recording 1e5 s at most]
 _SHORTEST = 1e-6
+# [chosen: the same]
 _LONGEST = 1e6
 # Largest difference of two values for the same time [s]: stamps have nanoseconds.
 # [chosen: any value in 1e-9..1e-4 would do]
@@ -162,35 +163,49 @@ def estimate_relative_pose(
     Returns
     -------
     RelativePose
-        Falsy, with `status` and `reason`, if the data determine no pose.
-
-    Raises
-    ------
-    InputError
-        (a ValueError) An argument of the wrong shape, not finite, or contradictory.
+        Falsy, with `status` and `reason`, if the data determine no pose. InputError (a
+        ValueError) is raised for arguments of the wrong shape, not finite, or contradictory.
     """
     matches = _checked_matches(points1, points2, quality)
-    rotation, covariance = _checked_rotation(relative_rotation, relative_rotation_covariance)
-    last = _checked_interval(interval, inertial)
-    _check_between(between, matches.points1, last)
-    rotations = [np.eye(3), *(frame.relative_rotation for frame in between), rotation]
-    covariances = [frame.relative_rotation_covariance for frame in between]
-    points = [matches.points1, *(frame.points for frame in between), matches.points2]
-    problem = PairProblem(
-        Matches(matches.track_ids, np.stack(points), matches.quality),
-        camera,
-        (motion1, *(frame.motion for frame in between), motion2),
-        np.array(
-            [0.0, *(frame.interval for frame in between), math.nan if last is None else last]
-        ),
-        _stacked(rotations),
-        _stacked([np.zeros((3, 3)), *covariances, covariance]),
-        (None, *(frame.inertial for frame in between), inertial),
-        config or EstimatorConfig(),
-        int(np.random.default_rng(rng).integers(2**63)),
-    )
+    rotation = _checked_rotation(relative_rotation, relative_rotation_covariance)
+    last = motion2, _checked_interval(interval, inertial), rotation, inertial
+    seed = int(np.random.default_rng(rng).integers(2**63))
+    problem = _problem(matches, camera, motion1, last, between, config or EstimatorConfig(), seed)
     pose = estimate(problem)
     return with_global_shutter_pixels(pose, problem) if global_shutter_pixels and pose else pose
+
+
+# Of the second frame: motion, time since the first one, rotation with covariance, acceleration.
+_Last = tuple[FrameMotion, float | None, tuple[Array | None, Array | None], InertialMotion | None]
+
+
+def _problem(
+    matches: Matches,
+    camera: RollingShutterCamera,
+    motion1: FrameMotion,
+    last: _Last,
+    between: Sequence[IntermediateFrame],
+    config: EstimatorConfig,
+    seed: int,
+) -> PairProblem:
+    """The problem of the checked arguments; InputError if `between` does not fit them."""
+    motion2, interval, (rotation, covariance), inertial = last
+    _check_between(between, matches.points1, interval)
+    points = [matches.points1, *(frame.points for frame in between), matches.points2]
+    rotations = [frame.relative_rotation for frame in between]
+    covariances = [frame.relative_rotation_covariance for frame in between]
+    end = math.nan if interval is None else interval
+    return PairProblem(
+        replace(matches, points=np.stack(points)),
+        camera,
+        (motion1, *(frame.motion for frame in between), motion2),
+        np.array([0.0, *(frame.interval for frame in between), end]),
+        _stacked([np.eye(3), *rotations, rotation]),
+        _stacked([np.zeros((3, 3)), *covariances, covariance]),
+        (None, *(frame.inertial for frame in between), inertial),
+        config,
+        seed,
+    )
 
 
 def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None) -> Matches:

@@ -66,6 +66,7 @@ DEGENERATE_THRESHOLDS = 2.0
 # and its bound: free velocities bend the epipolar bands, so that the best fit has more matches
 # than a single one. [measured: fits to random matches]
 CHANCE_SHARE = 10.0
+# [chosen: half of the matches, for thresholds of a tenth of the focal length]
 MOST_BY_CHANCE = 0.5
 # Sigmas of that number beyond which agreement is no chance. [derived: one of a million pairs]
 CHANCE_SIGMAS = 5.0
@@ -513,7 +514,7 @@ class Estimation:
         turns = self._rotations_to_reference_row(refined.state)
         pose = to_reference_row(at_middle, problem.reference_row_time, *turns)
         residuals = sampson.residuals(problem.observations, refined.state)
-        images = self._images(residuals)
+        images = self._images()
         sigma = math.sqrt(max(pose.covariance[18, 18], 0.0))
         no_baseline = self._no_baseline(sigma)
         v2w2 = np.r_[9:12, 15:18]
@@ -542,12 +543,17 @@ class Estimation:
             ),
         )
 
-    def _images(self, residuals: Array) -> covariance.ImageInformation | None:
+    def _images(self) -> covariance.ImageInformation | None:
         """Information of the images alone; None for models without all unknowns."""
         if not self.mode.model.derotated:
             return None
-        weights, sigma = noise_mixture(residuals, self.refined.inliers, self.config.pixel_sigma)
-        data = fit.FitMatches(self.problem.observations, weights, sigma)
+        observations = self.problem.observations
+        weights, sigma = noise_mixture(
+            sampson.residuals(observations, self.refined.state),
+            self.refined.inliers,
+            self.config.pixel_sigma,
+        )
+        data = fit.FitMatches(observations, weights, sigma)
         row_time = -self.problem.reference_row_time
         return covariance.image_information(
             data,

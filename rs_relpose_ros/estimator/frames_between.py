@@ -352,7 +352,7 @@ def _result(
     if _knows_inertial(path) and math.isfinite(pose.baseline):
         baseline = 1.0 / math.exp(state.log_scale)
         log_sigma = math.sqrt(C[LOG_SCALE, LOG_SCALE])
-    refined_pose = replace(
+    pose = replace(
         pose,
         R=R,
         t=state.t,
@@ -364,7 +364,7 @@ def _result(
         baseline=baseline,
         baseline_log_sigma=log_sigma,
     )
-    return refined_pose.diagnosed(
+    return pose.diagnosed(
         frames=len(path.motions),
         gyro_square=float(off @ np.linalg.solve(of_gyro, off)),
         pixel_sigma=adjusted.sigma,

@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.core.triangulate import depths_of_rays
+from rs_relpose_ros.core.losses import Flags
+from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.so3 import rotated, skew
+from rs_relpose_ros.jit import kernel
 
 
 class Status(str, Enum):
@@ -268,34 +270,58 @@ class Landmarks(NamedTuple):
 
 
 def landmarks(
-    pose: RelativePose, rays: Array, row_times: Array, camera: RollingShutterCamera
+    pose: RelativePose,
+    rays: Array,
+    row_times: Array,
+    camera: RollingShutterCamera,
 ) -> Landmarks:
     """Landmarks of the inliers of a pose, pixels on the sensor.
 
     `rays` (2, N, 3): unit rays of the matches, derotated to the stamped row of their frame.
     `row_times` (2, N): of the matches, from that of the stamped row [s].
     """
-    inliers = pose.inliers
-    f1, f2 = rays.compress(inliers, axis=1)
-    times1, times2 = row_times[:, inliers, None]
-    moved1 = times1 * pose.linear_velocity1
-    moved2 = times2 * pose.linear_velocity2
-    in_first = f2 @ pose.R.T
-    baselines = pose.t + moved2 @ pose.R.T - moved1
-    l1, l2, near = depths_of_rays(
-        f1,
-        in_first,
-        baselines,
-        _PARALLEL,
-    )
-    # Inverse distances: 0 at infinity.
-    equal1 = f1 + (near / l1)[:, None] * moved1
-    equal2 = f2 + (near / l2)[:, None] * moved2
-    point1 = l1[:, None] * equal1
-    point2 = pose.t + (l2[:, None] * equal2) @ pose.R.T
-    middle = 0.5 * (point1 + point2)
-    out = Landmarks(*(np.full((len(inliers), size), np.nan) for size in (2, 2, 3)))
-    out.pixels1[inliers] = camera.project(equal1)
-    out.pixels2[inliers] = camera.project(equal2)
-    out.points[inliers] = np.where(near[:, None], middle, np.nan)
-    return out
+    velocities = np.stack([pose.linear_velocity1, pose.linear_velocity2])
+    rays, points = _equivalent_rays(pose.inliers, rays, row_times, pose.R, pose.t, velocities)
+    return Landmarks(camera.project(rays[0]), camera.project(rays[1]), points)
+
+
+@kernel
+def _equivalent_rays(
+    use: Flags,
+    rays: Array,
+    row_times: Array,
+    R: Array,
+    t: Array,
+    velocities: Array,
+) -> tuple[Array, Array]:
+    """Rays (2, N, 3) of the inliers at the stamped rows, of any length, and points (N, 3).
+
+    `velocities` (2, 3): of each camera in its own frame. The rest is NaN.
+    """
+    out = np.full(rays.shape, np.nan)
+    points = np.full(rays.shape[1:], np.nan)
+    moved = np.empty((2, 3))
+    baseline = np.empty(3)
+    for i in range(len(use)):
+        if not use[i]:
+            continue
+        for k in range(2):
+            for j in range(3):
+                moved[k, j] = row_times[k, i] * velocities[k, j]
+        moved_in_first = rotated(R, moved[1])
+        for j in range(3):
+            baseline[j] = t[j] + moved_in_first[j] - moved[0, j]
+        depth1, depth2, squared_sine = scaled_depths(rays[0, i], rotated(R, rays[1, i]), baseline)
+        near = squared_sine > _PARALLEL and depth1 > 0.0 and depth2 > 0.0
+        for j in range(3):
+            # Inverse distances: 0 at infinity.
+            out[0, i, j] = rays[0, i, j] + (squared_sine / depth1 * moved[0, j] if near else 0.0)
+            out[1, i, j] = rays[1, i, j] + (squared_sine / depth2 * moved[1, j] if near else 0.0)
+        if near:
+            # The middle of the two points, which the rays give.
+            of_second = rotated(R, out[1, i])
+            for j in range(3):
+                point1 = depth1 / squared_sine * out[0, i, j]
+                point2 = t[j] + depth2 / squared_sine * of_second[j]
+                points[i, j] = 0.5 * (point1 + point2)
+    return out, points

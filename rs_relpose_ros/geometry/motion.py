@@ -19,12 +19,17 @@ from rs_relpose_ros.geometry.so3 import (
 )
 from rs_relpose_ros.jit import kernel
 
-# Far beyond any sensor: products of larger numbers may overflow.
-_LARGEST_RATE = 1e4  # [rad/s]
-_LONGEST = 1e6  # [s]
-_LARGEST = 1e4  # [m], [m/s], [m/s^2]
-_LARGEST_LEVER_ARM = 5.0  # [m]; more is a value in centimetres
-# Row times may lie outside of the gyro samples by this [s].
+# Largest rate of an argument [rad/s]: products of larger numbers may overflow.
+# [chosen: far beyond any sensor]
+_LARGEST_RATE = 1e4
+# Longest time of an argument [s]. [chosen: ten days, a mistaken unit]
+_LONGEST = 1e6
+# Largest displacement, velocity and acceleration of an argument [m], [m/s], [m/s^2].
+# [chosen: far beyond any carrier]
+_LARGEST = 1e4
+# Largest lever arm [m]; more is a value in centimetres. [chosen: no camera is so far from its IMU]
+_LARGEST_LEVER_ARM = 5.0
+# Row times may lie outside of the gyro samples by this [s]. [derived: rounding of nanoseconds]
 _TOLERANCE = 1e-6
 
 

@@ -488,13 +488,7 @@ def frame_imu(
     """
     half = to_nanoseconds(0.5 * exposure)
     span_ns = span_ns[0] + half, span_ns[1] - half  # of the middle of the rows' exposures
-    motion = _rows_motion(
-        buffer,
-        span_ns,
-        reference_ns,
-        R_cam_imu,
-        exposure,
-    )
+    motion = _rows_motion(buffer, span_ns, reference_ns, R_cam_imu, exposure)
     # The filter runs up to the last row; its direction is rotated back to the stamped row.
     gravity = None if gyro_only else buffer.gravity(span_ns[1])
     if gravity is not None:
@@ -508,25 +502,13 @@ def frame_imu(
         no_force = 'the accelerometer has a gap'
     since_previous = None
     if start_ns < reference_ns and buffer.covers(start_ns, reference_ns, exposure):
-        since_previous = _slice(
-            buffer,
-            (start_ns, reference_ns),
-            R_cam_imu,
-            exposure,
-            no_force,
-        )
+        since_previous = _slice(buffer, (start_ns, reference_ns), R_cam_imu, exposure, no_force)
         if not no_force and before is not None:
             since_previous = replace(
                 since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
             )
     sigma = None if gravity is None else gravity.sigma
-    imu = FrameImu(
-        motion,
-        sigma,
-        reference_ns,
-        since_previous,
-        no_force,
-    )
+    imu = FrameImu(motion, sigma, reference_ns, since_previous, no_force)
     if no_force or readout is None or gravity is None:
         return imu
     force = _mean_force(motion, readout[0] - reference_ns, readout[1] @ R_cam_imu.T)

@@ -57,6 +57,7 @@ _LEAST_SAMPLES = 10
 # is a motion, and would be learnt as bias. [measured: three times the noise of a MEMS IMU on a
 # table, a third of a hand that tries to be still]
 _REST_RATE = 0.01
+# [measured: the same]
 _REST_FORCE = 0.1
 # Correlation time of the remaining motion at rest [s]: samples within it count as one.
 # [chosen: tables and vehicles sway at some hertz]
@@ -426,27 +427,15 @@ def _correct(
     H[1, 2] = up[0]
     H[2, 1] = -up[0]
     _write_product_transposed(P, H, PHt)
-    S = np.zeros((3, 3))
-    adjugate = np.empty((3, 3))
-    for i in range(3):
-        S[i, i] = variance
-    _add_product(H, PHt, S)
-    _mirror(S)
-    for i in range(3):  # S^-1 = adj S / det S
-        adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
-    determinant = dot(S[0], adjugate[0])
-    K = np.zeros((6, 3))
-    KHP = np.empty((6, 6))
-    _add_product(PHt, adjugate, K)
+    K = _gain(H, PHt, variance)
     turn = np.zeros(3)
     for j in range(3):
         innovation = force[j] / length - up[j]
         residual[j] += min(dt / _LASTING, 1.0) * (innovation - residual[j])
         for i in range(3):
-            K[i, j] /= determinant
-            K[3 + i, j] /= determinant
             turn[i] += K[i, j] * innovation
             bias[i] += K[3 + i, j] * innovation
+    KHP = np.empty((6, 6))
     _write_product_transposed(K, PHt, KHP)
     P -= KHP
     _mirror(P)
@@ -463,6 +452,26 @@ def _correct(
     length = norm(up)
     for i in range(3):
         up[i] /= length
+
+
+@small_kernel
+def _gain(H: Array, PHt: Array, variance: float) -> Array:
+    """``K = P H^T S^-1`` (6, 3) with ``S = H P H^T + variance I``."""
+    S = np.zeros((3, 3))
+    adjugate = np.empty((3, 3))
+    for i in range(3):
+        S[i, i] = variance
+    _add_product(H, PHt, S)
+    _mirror(S)
+    for i in range(3):  # S^-1 = adj S / det S
+        adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
+    determinant = dot(S[0], adjugate[0])
+    K = np.zeros((6, 3))
+    _add_product(PHt, adjugate, K)
+    for i in range(6):
+        for j in range(3):
+            K[i, j] /= determinant
+    return K
 
 
 @small_kernel

@@ -10,9 +10,10 @@ from dataclasses import replace
 from functools import reduce
 from typing import Any
 
-from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.config.settings import Parameters, sensor_model, TrackingConfig
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
@@ -33,7 +34,7 @@ def view_frame(
     imu : ImuBuffer
         Must cover the readout; frames are to be given in the order of time.
     parameters : Parameters
-        Those of camera and IMU.
+        Camera and IMU.
     since : Frame, optional
         An earlier result: if the buffer extends back to it, the gyro between is kept, too.
 
@@ -97,44 +98,35 @@ def estimate_wide_pair(
             'the intrinsics changed between the two frames: one calibration must hold for both'
         )
     sensor = sensor_model(first.intrinsics, parameters.sensor)
-    tracking = parameters.tracking
+    interval = pair.interval_of(first.imu, second.imu)
+    near = interval <= parameters.keyframes.max_keyframe_interval
+    history, matches = _matched(first, second, parameters.tracking, between if near else ())
+    pose = estimate(history.problem(second.stamp_ns, matches, sensor, parameters, near=near))
+    rays = pair.derotated(matches, first.imu.motion, second.imu.motion, sensor)
+    return history.result(second, rays, pose, sensor, parameters)
+
+
+def _matched(
+    first: Frame[Any],
+    second: Frame[Any],
+    tracking: TrackingConfig,
+    between: Sequence[Frame[Any]],
+) -> tuple[TrackHistory, Matches]:
+    """The frames of a pair with their matches to the first one, and the matches of the second."""
     if tracking.detector == 'klt':  # it has no descriptors
         tracking = replace(tracking, detector='sift')
     tracker = DescriptorTracker(tracking)
     tracker.start(first.image)
-    since = _since(first, second)
-    interval = pair.interval_of(first.imu, second.imu)
-    near = interval <= parameters.keyframes.max_keyframe_interval
     history = TrackHistory(first.stamp_ns, first.imu)
-    if since is not None and near:
+    since = _since(first, second)
+    if since is not None:
         for frame in used_frames(between):
             to_frame = _since(first, frame)
             if to_frame is not None and frame.intrinsics == first.intrinsics:
                 history.add(frame.imu, to_frame, tracker.track(frame.image))
     matches = tracker.track(second.image)
     history.add(second.imu, since, matches)
-    pose = estimate(
-        history.problem(
-            second.stamp_ns,
-            matches,
-            sensor,
-            parameters,
-            near=near,
-        )
-    )
-    rays = pair.derotated(
-        matches,
-        first.imu.motion,
-        second.imu.motion,
-        sensor,
-    )
-    return history.result(
-        second,
-        rays,
-        pose,
-        sensor,
-        parameters,
-    )
+    return history, matches
 
 
 def _since(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
@@ -145,15 +137,15 @@ def _since(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
     return since
 
 
-# Of the earlier and of the later image of a pair [ns].
+# Stamps of the earlier and of the later image of a pair [ns].
 Stamps = tuple[int, int]
 
 
 class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
     """Estimates the `wanted` pairs: results by their stamps, or the reasons for none.
 
-    Frames are kept until the last of their pairs, those after them for `max_keyframe_interval`,
-    and the IMU data of all frames since the oldest of them.
+    A frame is kept until the last of its pairs, the frames after it for `max_keyframe_interval`,
+    and the IMU data of all frames since the oldest frame that is kept.
     """
 
     def __init__(self, wanted: Collection[Stamps]) -> None:
@@ -205,7 +197,7 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         return pairs or None
 
     def _pair(self, first_ns: int, second: Frame[Any], parameters: Parameters) -> PairResult | str:
-        """Of an earlier frame and the current one."""
+        """The pair of an earlier frame and the current one, or the reason for none."""
 
         def since_first(frame: Frame[Any]) -> Frame[Any]:
             slices = [

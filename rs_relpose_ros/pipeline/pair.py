@@ -146,6 +146,11 @@ class PairResult:
         return None if self.landmarks_of is None else self.landmarks_of()
 
     @property
+    def inliers(self) -> int:
+        """Number of matches that agree with the pose."""
+        return int(np.count_nonzero(self.pose.inliers))
+
+    @property
     def gyro_difference(self) -> float:
         """Angle between the rotations by gyro and by images alone [deg]; NaN without either."""
         if self.images_against_gyro is None:
@@ -166,15 +171,11 @@ class PairMetric(NamedTuple):
         return '' if math.isnan(value) else f'{value:.{self.digits}f}'
 
 
-def _inliers(pair: PairResult) -> int:
-    return int(np.count_nonzero(pair.pose.inliers))
-
-
 # The one list for topics, /diagnostics and files.
 PAIR_METRICS = (
     PairMetric('matches', lambda pair: len(pair.matches), 0),
-    PairMetric('inliers', _inliers, 0),
-    PairMetric('inlier_ratio', lambda pair: _inliers(pair) / max(len(pair.matches), 1), 3),
+    PairMetric('inliers', lambda pair: pair.inliers, 0),
+    PairMetric('inlier_ratio', lambda pair: pair.inliers / max(len(pair.matches), 1), 3),
     PairMetric('parallax_px', lambda pair: pair.parallax, 1),
     PairMetric('residual_rms_px', lambda pair: pair.pose.diagnostics.residual_rms, 2),
     PairMetric('pixel_sigma_px', lambda pair: pair.pose.diagnostics.pixel_sigma, 3),
@@ -198,14 +199,23 @@ def derotated(
     Points of the reference image do not move: their rays are taken from `known`, derotated
     matches with the same reference, if it has all of the tracks.
     """
-    rows = None if known is None else positions(known.track_ids, matches.track_ids)
-    if known is not None and rows is not None and len(rows) == len(matches):
-        rays1 = known.rays[0][rows]
-        times1 = known.row_times[0][rows]
-    else:
-        rays1, times1 = sensor.derotated(matches.points1, motion1)
-    rays2, times2 = sensor.derotated(matches.points2, motion2)
-    return replace(matches, rays=np.stack([rays1, rays2]), row_times=np.stack([times1, times2]))
+    first = None if known is None else _known_rays(known, matches.track_ids)
+    if first is None:
+        first = sensor.derotated(matches.points1, motion1)
+    second = sensor.derotated(matches.points2, motion2)
+    return replace(
+        matches,
+        rays=np.stack([first[0], second[0]]),
+        row_times=np.stack([first[1], second[1]]),
+    )
+
+
+def _known_rays(known: Matches, track_ids: Ids) -> tuple[Array, Array] | None:
+    """Rays and row times of tracks in the reference image; None unless all are known."""
+    rows = positions(known.track_ids, track_ids)
+    if len(rows) < len(track_ids):
+        return None
+    return known.rays[0][rows], known.row_times[0][rows]
 
 
 @kernel
@@ -241,9 +251,11 @@ def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
 
 def parallax_of(matches: Matches, since: ImuSlice | None, sensor: Sensor) -> float:
     """Median parallax [px] of derotated matches, with the gyro's rotation between the frames."""
-    rays1, rays2 = matches.rays
-    rotation = aligning_rotation(rays1.T @ rays2) if since is None else since.rotation
-    return sensor.camera.fx * median_parallax(rays1, rays2, rotation)
+    if since is None:
+        rotation = aligning_rotation(matches.rays[0].T @ matches.rays[1])
+    else:
+        rotation = since.rotation
+    return sensor.camera.fx * median_parallax(*matches.rays, rotation)
 
 
 def interval_of(first: FrameImu, second: FrameImu) -> float:
@@ -260,6 +272,7 @@ _LARGEST_GRAVITY_SIGMA = 1.5
 # accuracy; with three, the largest errors of long pairs were a quarter larger on recordings.
 # [measured: recordings, together with the removal of observations far from a first result]
 MOST_FRAMES = 5
+# Statuses of pairs whose images may be dark.
 _LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
 
 
@@ -473,14 +486,14 @@ def _with_gravity(
     return imu1.motion, imu2.motion, sigma
 
 
-def _points(tracked: Matches, wanted: Matches) -> Array:
-    """Second points (N, 2) of the `wanted` tracks (N); NaN where one was not tracked."""
-    rows = positions(tracked.track_ids, wanted.track_ids)
-    if len(rows) == len(wanted):  # no track was lost meanwhile, or changed its place
+def _points(tracked: Matches, matches: Matches) -> Array:
+    """Second points (N, 2) of `tracked` for the tracks of `matches`; NaN where one was lost."""
+    rows = positions(tracked.track_ids, matches.track_ids)
+    if len(rows) == len(matches):  # no track was lost meanwhile, or changed its place
         return tracked.points2[rows]
-    points = np.full((len(wanted), 2), np.nan)
+    points = np.full((len(matches), 2), np.nan)
     _, here, there = np.intersect1d(
-        wanted.track_ids, tracked.track_ids, assume_unique=True, return_indices=True
+        matches.track_ids, tracked.track_ids, assume_unique=True, return_indices=True
     )
     points[here] = tracked.points2[there]
     return points

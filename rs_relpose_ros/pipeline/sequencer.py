@@ -26,24 +26,37 @@ from rs_relpose_ros.pipeline.monitor import Applied
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
-# A stamp further behind the newest one [ns] is a bag that restarts, not a late message.
+# A stamp further behind the newest one [ns] is a bag that restarts, not a late message. With less,
+# messages out of order restart the tracking; with more, a looped short bag is refused.
+# [chosen: no driver delays a message by a second]
 CLOCK_JUMP_NS = NANOSECONDS
 # A single stamp further from the one before [ns] is no time of this stream.
+# [chosen: no camera pauses for so long between two images of one run]
 _FAR_NS = 10 * NANOSECONDS
-# Number of consecutive stamps behind the newest, each newer than the one before, that indicate a
-# clock that was set back by less than that: messages out of order come alone.
+# Number of consecutive frames behind the newest stamp, each newer than the one before, that
+# indicate a clock that was set back by less than that: messages out of order come alone.
+# [chosen: a tenth of a second at 30 Hz]
 _BACK_FRAMES = 3
+# The same of samples of the IMU. [chosen: a tenth of a second at 200 Hz]
 _BACK_SAMPLES = 20
-# Most frames that wait for the worker (bounds the latency), and for the IMU (the memory).
+# Most frames that wait for the worker: they bound the latency of a worker that is too slow. With
+# less, a single slow pair loses frames. [chosen: a sixth of a second at 30 Hz]
 MAILBOX_FRAMES = 5
+# Most frames that wait for the IMU: they bound the memory. [chosen: half a second at 30 Hz]
 WAITING_FRAMES = 16
-# Longest time [ns] that a frame waits for the IMU.
+# Longest time [ns] that a frame waits for the IMU. [chosen: no driver is late by a second]
 MAX_IMU_WAIT_NS = NANOSECONDS
-# Delay [ns] behind the gyro above which frames do not wait for an accelerometer of its own topic.
+# Delay [ns] behind the gyro above which frames do not wait for an accelerometer of its own topic:
+# one that has ended must not stop the frames. [chosen: ten periods of a slow accelerometer]
 _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
 # Most refusals that are kept until they are taken; the counters lose none.
+# [chosen: some seconds of frames]
 _REFUSALS_KEPT = 256
+# Refused with this reason where the gyro has a gap.
 _IMU_GAP = 'the gyro does not cover the readout of the frame: it has a gap there, or begins later'
+# An exposure is longer than the interval between frames beyond this ratio of the two: stamps
+# jitter. [chosen: a quarter of the interval for both stamps of a phone]
+_LONGEST_EXPOSURE = 1.25
 
 
 class Refusal(str, Enum):
@@ -217,8 +230,8 @@ class Sequencer:
             self._last_stamp_ns = stamp_ns
             # Of all frames that come, also of those refused later: live as in replay.
             interval_ns = self._intervals.add(stamp_ns)
-            # A quarter: of stamps that jitter.
-            if interval_ns and clock.exposure_time * NANOSECONDS > 1.25 * interval_ns:
+            exposure_ns = clock.exposure_time * NANOSECONDS
+            if interval_ns and exposure_ns > _LONGEST_EXPOSURE * interval_ns:
                 self._refuse(
                     stamp_ns,
                     Refusal.BAD_IMAGE,
@@ -287,23 +300,17 @@ class Sequencer:
             # Offline nothing comes while one waits.
             deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
             while (head := self._decided_head()) is None:
-                now_ns = self._now()
-                until_ns = deadline_ns
-                if self._closed or now_ns >= deadline_ns:
+                if not self._waits(deadline_ns):
                     return None
-                if self._queue:
-                    until_ns = min(until_ns, self._queue[0].received_ns + MAX_IMU_WAIT_NS)
-                self._changed.wait(max(until_ns - now_ns, 0) / NANOSECONDS)
         if isinstance(head, FrameRefused):
             return head
         image = head.image
         taken_ns = self._now()
         try:
-            values, encoding = (
-                image.pixels(self._levels)
-                if self._colors
-                else (image.decoded(self._levels), 'mono8')
-            )
+            if self._colors:
+                values, encoding = image.pixels(self._levels)
+            else:
+                values, encoding = image.decoded(self._levels), 'mono8'
             frame: Frame[Any] = Frame(
                 image.stamp_ns,
                 values,
@@ -317,22 +324,17 @@ class Sequencer:
                 taken_ns=taken_ns,
             )
         except InputError as error:
-            with self._changed:
-                self._refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
-                return self._refusals.popleft()
+            return self._refused(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
-            if (
-                head.generation != self._generation
-                or self._buffer.gyro.coverage(*span_ns) is not Coverage.AVAILABLE
-            ):
-                self._refuse(
+            coverage = self._buffer.gyro.coverage(*span_ns)
+            if head.generation != self._generation or coverage is not Coverage.AVAILABLE:
+                return self._refused(
                     frame.stamp_ns,
                     Refusal.CLOCK_JUMP,
                     'stamps jumped while the frame was decoded: its gyro samples are lost',
                 )
-                return self._refusals.popleft()
             reference_ns = head.reference_ns + self._offset_ns
             previous_ns = self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
@@ -352,6 +354,22 @@ class Sequencer:
             self._taken_generation = self._generation
             self._counts.frames_taken += 1
             return frame
+
+    def _waits(self, deadline_ns: int) -> bool:
+        """Wait for a change of the queue, or until its head is too old; False at the deadline."""
+        now_ns = self._now()
+        if self._closed or now_ns >= deadline_ns:
+            return False
+        if self._queue:
+            deadline_ns = min(deadline_ns, self._queue[0].received_ns + MAX_IMU_WAIT_NS)
+        self._changed.wait(max(deadline_ns - now_ns, 0) / NANOSECONDS)
+        return True
+
+    def _refused(self, stamp_ns: int, refusal: Refusal, reason: str) -> FrameRefused:
+        """Refuse a frame that was taken; the oldest refusal."""
+        with self._changed:  # a lock that its owner may take again
+            self._refuse(stamp_ns, refusal, reason)
+            return self._refusals.popleft()
 
     def counts(self) -> SequencerCounts:
         """A snapshot of the counters."""
@@ -493,10 +511,14 @@ class Sequencer:
 
 # -- Scatter of image stamps about an even rhythm: phones stamp some ms early or late -------------
 
+# Frames over which the scatter is estimated: less is noise, more follows a change too late.
+# [chosen: a second at 30 Hz]
 SCATTER_FRAMES = 32
 # Intervals below this quantile of all contain no lost frame.
+# [derived: less than three of four intervals are lost or doubled]
 _WHOLE = 0.25
 # A larger scatter, as a share of the interval, is a camera without a rhythm.
+# [chosen: phones scatter by some ms of 33]
 _LARGEST_SHARE = 0.1
 
 

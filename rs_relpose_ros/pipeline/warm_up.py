@@ -43,6 +43,7 @@ from rs_relpose_ros.tracking.images import RawImage
 # Size of the made-up images [px]: small, as their content does not matter, but large enough to be
 # searched at half size, as most images are. [chosen: any size above 240 would do]
 _WIDTH = 320
+# [chosen: the same]
 _HEIGHT = 240
 # With distortion, so that its kernels are compiled, too.
 _INTRINSICS = Intrinsics(
@@ -156,6 +157,7 @@ _UNREACHABLE = 10_000
 # Arguments of this module for processes that another one has started: they compile all kernels,
 # or those of the two-view estimate alone.
 _WHOLE = 'whole'
+# See above.
 _HALF = 'half'
 
 

@@ -73,7 +73,9 @@ def is_dark(image: Image) -> bool:
 
 # -- Size of a JPEG or PNG, from its header -------------------------------------------------------
 
+# First bytes of the files.
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+# Start of an image, and of the next marker.
 _JPEG_SIGNATURE = b'\xff\xd8\xff'
 # Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC.
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -171,6 +173,7 @@ _ENCODED = {
 # Two bytes per pixel, of which a camera may fill some bits only.
 _GRAY_16 = ('mono16', '16UC1')
 
+# All encodings that are known, in the words of sensor_msgs/Image.
 ENCODINGS = (
     'mono8',
     '8UC1',

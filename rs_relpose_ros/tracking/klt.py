@@ -34,6 +34,7 @@ _WORTH = 2.0
 # [chosen: a step of 0.02 px is a tenth of the noise of a match, one of 0.005 px a fortieth]
 _ENDS = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _TRACKING_CRITERIA = (_ENDS, 15, 0.02)
+# [chosen: the same]
 _ALIGNMENT_CRITERIA = (_ENDS, 20, 0.005)
 # Errors of a guess [px] that are corrected without a pyramid. A larger value lets windows find
 # neighbours of the same look, a smaller one costs a pyramid more often. [derived: half of _REACH]
