@@ -6,7 +6,7 @@ import re
 
 import yaml
 
-from rs_relpose_ros.bags import convert
+from rs_relpose_ros.bags.convert import recording, text_files
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -46,7 +46,7 @@ def ordered_samples(samples: Iterable[ImuSample]) -> tuple[ImuSample, ...]:
     return tuple(by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp))
 
 
-def read_realsense(folder: Path) -> convert.Recording:
+def read_realsense(folder: Path) -> recording.Recording:
     """Colour camera and IMU of a RealSense, as cut from the DM-VIO dataset of Zoltan3057.
 
     https://github.com/Zoltan3057/DM-VIO-dataset, commit 7f0fcff8a45b7bbcb70f509e8c926454a9971a2b::
@@ -58,17 +58,17 @@ def read_realsense(folder: Path) -> convert.Recording:
         images/       JPEG, gray
     """
     title, parameters = packaged('realsense_rgb_rs')
-    return convert.Recording(
+    return recording.Recording(
         _realsense_camera(folder / 'camera.txt', _readout_time(parameters)),
         tuple(
-            convert.image_file(
-                row.nanoseconds('stamp_ns'), convert.file_inside(folder, row, 'file')
+            recording.image_file(
+                row.nanoseconds('stamp_ns'), text_files.file_inside(folder, row, 'file')
             )
-            for row in convert.read_table(folder / 'frames.csv')
+            for row in text_files.read_table(folder / 'frames.csv')
         ),
         ordered_samples(
             ImuSample(row.nanoseconds(0), row.vector(1, 2, 3), row.vector(4, 5, 6))
-            for row in convert.read_rows(folder / 'imu.txt', range(7), separator=None)
+            for row in text_files.read_rows(folder / 'imu.txt', range(7), separator=None)
         ),
         title,
         parameters,
@@ -82,7 +82,7 @@ def _realsense_camera(path: Path, readout_time: float) -> RollingShutterCamera:
     # Only the first two lines are calibration: then DM-VIO's own crop follows.
     lines = path.read_text(encoding='utf-8', errors='replace').splitlines()[:2]
     rows = [
-        convert.Row(path, number, dict(enumerate(line.split())))
+        text_files.Row(path, number, dict(enumerate(line.split())))
         for number, line in enumerate(lines, start=1)
     ]
     if [len(row.words) for row in rows] != [5, 2]:
@@ -100,7 +100,7 @@ def _realsense_camera(path: Path, readout_time: float) -> RollingShutterCamera:
     )
 
 
-def read_xiaomi(folder: Path) -> convert.Recording:
+def read_xiaomi(folder: Path) -> recording.Recording:
     """Phone camera and gyro, as cut from gyro-video-stabilization of lhaippp.
 
     https://github.com/lhaippp/gyro-video-stabilization (MIT), folder 20200109_145447, commit
@@ -114,7 +114,7 @@ def read_xiaomi(folder: Path) -> convert.Recording:
     """
     stamps = [
         row.seconds_as_nanoseconds(0)
-        for row in convert.read_rows(folder / 'framestamp.txt', range(1))
+        for row in text_files.read_rows(folder / 'framestamp.txt', range(1))
     ]
     if not (folder / 'images').is_dir():
         raise MissingInputError(f'the folder of images is missing: there is no {folder}/images')
@@ -140,12 +140,12 @@ def read_xiaomi(folder: Path) -> convert.Recording:
         cy=309.0112,
         readout_time=_readout_time(parameters),
     )
-    return convert.Recording(
+    return recording.Recording(
         camera,
-        tuple(convert.image_file(stamps[number - 1], found[number]) for number in sorted(found)),
+        tuple(recording.image_file(stamps[number - 1], found[number]) for number in sorted(found)),
         ordered_samples(
             ImuSample(row.seconds_as_nanoseconds(3), row.vector(0, 1, 2), None)
-            for row in convert.read_rows(folder / 'gyro.txt', range(4))
+            for row in text_files.read_rows(folder / 'gyro.txt', range(4))
         ),
         title,
         parameters,

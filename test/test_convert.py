@@ -18,9 +18,9 @@ from recorded_files import removed, replaced, written
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab import datasets
-from rs_relpose_ros.bags.convert import read_rows, Row
+from rs_relpose_ros.bags.convert.text_files import read_rows, Row
+from rs_relpose_ros.bags.convert.video import START_NS
 from rs_relpose_ros.bags.reader import BagMessage, open_bag
-from rs_relpose_ros.bags.recorders import START_NS
 from rs_relpose_ros.cli import main
 from rs_relpose_ros.config.files import parameter_text, read_parameters
 from rs_relpose_ros.config.settings import Parameters

@@ -22,9 +22,10 @@ import pytest
 from recorded_files import make_posecam, make_realsense, make_tables
 
 from rs_relpose_lab.datasets import read_realsense
-from rs_relpose_ros.bags.convert import write_bag
+from rs_relpose_ros.bags.convert.android import read_posecam
+from rs_relpose_ros.bags.convert.phone import read_tables
+from rs_relpose_ros.bags.convert.recording import write_bag
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.bags.recorders import read_posecam, read_tables
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera

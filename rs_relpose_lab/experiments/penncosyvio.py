@@ -31,7 +31,7 @@ from rs_relpose_lab.simulation.render import view_of
 from rs_relpose_lab.simulation.rows import in_both_views, in_front, measured, Motion
 from rs_relpose_lab.simulation.simulation import ImuModel
 from rs_relpose_lab.simulation.trajectory import CameraStates
-from rs_relpose_ros.bags.convert import read_rows
+from rs_relpose_ros.bags.convert.text_files import read_rows
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import Array

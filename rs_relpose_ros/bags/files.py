@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from rs_relpose_ros.bags.convert import how_to_convert
 from rs_relpose_ros.bags.mcap import McapStorage
 from rs_relpose_ros.bags.ros1 import Ros1Storage
 from rs_relpose_ros.bags.sqlite import SqliteStorage
@@ -159,7 +160,10 @@ def _files_of(folder: Path, metadata: Metadata) -> list[Path]:
                 f'{folder} is damaged: {" and ".join(metadata.files)}, which its {_METADATA} '
                 'names, is not there: copy it again'
             )
-        raise InputError(f'{folder} is no bag: it has no {_METADATA} and no {_or(SUFFIXES)} file')
+        raise InputError(
+            f'{folder} is no bag: it has no {_METADATA} and no {_or(SUFFIXES)} file'
+            f'{how_to_convert(folder)}'
+        )
     if not listed:
         if not (folder / _METADATA).exists():
             _logger.warning(
@@ -254,7 +258,7 @@ def _source(file: Path, path: Path) -> Source | None:
     if file == path and file.suffix not in (*SUFFIXES, '.active'):
         raise InputError(
             f'{path} is no bag: give a rosbag2 directory (with {_METADATA}) or '
-            'a .mcap, .db3 or .bag file'
+            f'a .mcap, .db3 or .bag file{how_to_convert(path)}'
         )
     return None
 

@@ -10,15 +10,22 @@ import shutil
 import sys
 from typing import Any, NamedTuple
 
-from rs_relpose_ros.bags import recorders
-from rs_relpose_ros.bags.convert import Recording, write_bag
+from rs_relpose_ros.bags.convert import android, apple, FORMATS, phone, video
+from rs_relpose_ros.bags.convert.euroc import read_euroc
+from rs_relpose_ros.bags.convert.recording import Recording, write_bag
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibrate.procedure import read_recording
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
-from rs_relpose_ros.config.files import read_parameters, write_parameters
+from rs_relpose_ros.config.files import (
+    parameter_text,
+    read_calibration,
+    read_parameters,
+    SourcedValue,
+    write_parameters,
+)
 from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
@@ -251,19 +258,40 @@ def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
     return read
 
 
+# Logger of phones, as named in `FORMATS`, and its reader.
+PHONES: Mapping[str, phone.Reader] = {
+    'PoseCam': android.read_posecam,
+    'MARS Logger': android.read_mars,
+    'OpenCamera Sensors': android.read_opencamera_sensors,
+    'VideoIMUCapture': android.read_video_imu_capture,
+    'Stray Scanner': apple.read_stray_scanner,
+    'ios_logger': apple.read_ios_logger,
+    'Sensor Logger': apple.read_sensor_logger,
+    'tables': phone.read_tables,
+}
+_PHONE = Source(
+    "folder of a phone's logger, recognised by its files: "
+    + '; '.join(str(one) for one in FORMATS if one.name in PHONES),
+    'FOLDER',
+    lambda folder, _: phone.read_phone(folder, PHONES),
+)
+
 # Formats of recordings by the name that the user types. [derived: interface]
 SOURCES: Mapping[str, Source] = {
     'video': Source(
         'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
         '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
         'FILE',
-        recorders.read_video,
+        video.read_video,
         has_lens_profile=True,
     ),
-    'android': Source(
-        f"folder of a phone's logger, recognised by its files: {recorders.known_loggers()}",
+    'phone': _PHONE,
+    'android': _PHONE._replace(help='the same as phone'),
+    'euroc': Source(
+        "folder in the format of EuRoC's MAV data set (mav0 with cam0, imu0, sensor.yaml); the "
+        'camera may have a rolling shutter, as that of TUM RS-VI',
         'FOLDER',
-        lambda folder, _: recorders.read_android(folder),
+        lambda folder, _: read_euroc(folder),
     ),
     'realsense_rgb_rs': Source(
         'colour camera, gyro and accelerometer of a RealSense, from '
@@ -301,9 +329,44 @@ def _add_convert_arguments(parser: argparse.ArgumentParser) -> None:
                 'an initial value of the readout time if the file does not contain it',
             )
         one.set_defaults(lens_profile=None)
+    text = (
+        'calibration file of another tool as parameters: Kalibr (camchain, imu), OpenVINS, '
+        'ORB-SLAM3, sensor.yaml of EuRoC, ost.yaml of camera_calibration. --params accepts these '
+        'files, too.'
+    )
+    calibration_parser = sources.add_parser('calibration', help=text, description=text)
+    calibration_parser.add_argument('path', metavar='FILE', type=Path, help='the calibration')
+    calibration_parser.add_argument(
+        '--out',
+        metavar='YAML',
+        type=Path,
+        help='parameter file to write; without it the parameters are printed',
+    )
+
+
+def _convert_calibration(path: Path, out: Path | None) -> int:
+    if out is not None:
+        refuse_existing(out)
+        refuse_unwritable(out.parent)
+    found = read_calibration(path)
+    settings.Parameters().updated(found.values)  # InputError for values out of range
+    title = f'Parameters of relpose_node from {path.name} (`rs_relpose convert calibration`).'
+    source = f'{found.tool}.'
+    values = [SourcedValue(name, value, source) for name, value in found.values.items()]
+    if out is None:
+        print(parameter_text(title, values), end='')
+        return 0
+    write_parameters(out, title, values)
+    size = '' if found.size is None else f' for images of {found.size[0]}x{found.size[1]}'
+    print(f'{out}: {found}{size}')
+    if 'camera_matrix' in found.values:
+        print('the readout time is not in this file: rs_relpose calibrate BAG measures it')
+    return 0
 
 
 def _convert(args: argparse.Namespace) -> int:
+    if args.source == 'calibration':
+        return _convert_calibration(args.path, args.out)
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
     refuse_existing(args.out_bag, parameters)
     refuse_unwritable(args.out_bag.parent)

@@ -10,6 +10,7 @@ writes all parameters at their defaults, with descriptions.
 from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
+import logging
 import math
 from pathlib import Path
 import sys
@@ -18,9 +19,12 @@ from typing import Any
 
 import yaml
 
+from rs_relpose_ros.config.calibration_files import Calibration, calibration_of, plain_yaml
 from rs_relpose_ros.config.settings import ANY_VALUE, Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.output_files import written
+
+_logger = logging.getLogger(__name__)
 
 _NODE = 'relpose_node'
 # Parameters of every ROS node, without effect offline.
@@ -52,7 +56,8 @@ def read_parameters(
 ) -> Parameters:
     """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
 
-    The file is one for ``ros2 run --params-file`` of `node`; the values of assignments are YAML,
+    The file is one for ``ros2 run --params-file`` of `node`, or a calibration of another tool
+    (`calibration_files`); the values of assignments are YAML,
     such as ``gyro_bias=[0.01, 0, 0]``.
 
     >>> read_parameters(None, ['readout_time=0.03', 'solver=angular_5pt']).sensor.readout_time
@@ -118,27 +123,50 @@ def yaml_text(value: Any) -> str:
 
 
 def file_values(path: Path, wanted: str = _NODE) -> dict[str, Any]:
-    """Flat values of a parameter file for the node `wanted`."""
+    """Return flat values of a parameter file for the node `wanted`, or of a calibration."""
+    return text_values(_text_of(path), str(path), wanted)
+
+
+def _text_of(path: Path) -> str:
     if not path.is_file():
         raise MissingInputError(f'the parameter file {path} does not exist')
     if path.stat().st_size > _MAX_BYTES:
         raise InputError(f'{path} is not a parameter file: it has more than {_MAX_BYTES} bytes')
     try:
-        text = path.read_text(encoding='utf-8')
+        return path.read_text(encoding='utf-8')
     except UnicodeDecodeError as error:
         raise InputError(f'{path} is not valid YAML: {error}') from error
-    return text_values(text, str(path), wanted)
 
 
-def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
-    """The same from the text of a file."""
+def read_calibration(path: Path) -> Calibration:
+    """Read the calibration file of another tool; InputError if it is none."""
+    found = calibration_of(_document(_text_of(path), str(path)), str(path))
+    if found is None:
+        raise InputError(
+            f'{path} is no calibration of Kalibr (camchain, imu), OpenVINS, ORB-SLAM3, EuRoC '
+            '(sensor.yaml) or camera_calibration (ost.yaml)'
+        )
+    return found
+
+
+def _document(text: str, path: str) -> Any:
+    text = plain_yaml(text)
     try:
         # Nested aliases expand without a limit; ROS does not support them either.
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             raise InputError(f'{path} has YAML aliases, which are not supported')
-        document = yaml.safe_load(text)
+        return yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
         raise InputError(f'{path} is not valid YAML: {error}') from error
+
+
+def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
+    """Return the same from the text of a file."""
+    document = _document(text, path)
+    calibration = calibration_of(document, path)
+    if calibration is not None:
+        _logger.warning('%s is a calibration file (%s): these are used', path, calibration)
+        return calibration.values
     if not isinstance(document, dict):
         raise InputError(
             f'{path} is not a ROS parameter file: it must begin with "/**:" and "ros__parameters:"'

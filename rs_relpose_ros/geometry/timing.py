@@ -17,6 +17,8 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 
 # Nanoseconds in a second. [derived: definition]
 NANOSECONDS = 1_000_000_000
+# Stamps of ROS end here [ns]: their seconds are an int32. [derived: builtin_interfaces/Time]
+END_OF_STAMPS_NS = 2**31 * NANOSECONDS
 
 # Share of the exposure of the stamped row from the time that the stamp marks to the middle of this
 # exposure. [derived: definition of the parameter stamp_exposure]

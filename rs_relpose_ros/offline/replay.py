@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rs_relpose_ros.bags.convert import check_file, read_rows, Row
+from rs_relpose_ros.bags.convert.text_files import check_file, read_rows, Row
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
