@@ -388,9 +388,10 @@ def test_the_bundled_bag_is_good(bundled_bag, parameters):
     for quantity in QUANTITIES:
         finding = findings[quantity.code]
         assert finding.as_json()['figures']['figure'] == quantity.code
-        assert finding.observable
-        assert abs(finding.estimated - finding.configured) < 4.0 * finding.sigma
-    assert findings['time_offset'].sigma < 2e-3
+        found = finding.finding
+        assert found.observable
+        assert abs(found.estimate - found.active) < 4.0 * found.sigma
+    assert findings['time_offset'].finding.sigma < 2e-3
     assert findings['parameters'].finding.evidence.measured['nearest'] == (
         'cam x = -imu y, cam y = -imu z, cam z = +imu x'
     )
@@ -413,7 +414,7 @@ def test_parameters_that_contradict_the_recording(
     findings, report = checked(short_bag, parameters.updated(tracking | changes))
     assert [f.code for f in report.findings if f.state is F] == [name]
     assert report.failed
-    assert findings[name].estimated == pytest.approx(truth, abs=tolerance)
+    assert findings[name].finding.estimate == pytest.approx(truth, abs=tolerance)
     if 'readout' in name:
         assert findings['time_offset'].state is FindingState.UNKNOWN
         # The rolling-shutter effect is that of the estimate.
@@ -431,7 +432,7 @@ def test_messages_that_contradict_each_other(bundled_bag, parameters, tmp_path):
     path = copied(bundled_bag, tmp_path / 'bag', longer, 4.0)
     findings, _ = checked(path, parameters)
     assert findings['focal_length'].state in (W, F), findings['focal_length']
-    assert findings['focal_length'].estimated == pytest.approx(450.0, abs=10.0)
+    assert findings['focal_length'].finding.estimate == pytest.approx(450.0, abs=10.0)
     assert FindingState.OK not in {findings[quantity.code].state for quantity in QUANTITIES}
 
 
@@ -444,8 +445,11 @@ def test_missing_parameters_are_estimated(short_bag):
     assert 'cam x = -imu y, cam y = -imu z, cam z = +imu x' in findings['axes'].message
     assert 'bottom' in findings['axes'].message  # direction of gravity
     readout = findings['readout_time']
-    assert (readout.configured, readout.estimate) == (None, pytest.approx(0.03, abs=2e-3))
-    assert abs(findings['time_offset'].estimated) < 3e-3
+    assert (readout.finding.active, readout.finding.estimate) == (
+        None,
+        pytest.approx(0.03, abs=2e-3),
+    )
+    assert abs(findings['time_offset'].finding.estimate) < 3e-3
     assert findings['rolling shutter'].finding.evidence.measured['readout_s'] == pytest.approx(
         0.03, abs=2e-3
     )
@@ -622,7 +626,7 @@ def test_gross_errors_in_little_light(converted):
     findings, report = checked(path, read_parameters(f'{path}.yaml', ['time_offset=-0.0305']))
     # The stamp of another row makes nearly the same offset.
     assert {f.code for f in report.findings if f.state is F} - {'stamp_row'} == {'time_offset'}
-    assert findings['time_offset'].estimated == pytest.approx(-0.0635, abs=6e-3)
+    assert findings['time_offset'].finding.estimate == pytest.approx(-0.0635, abs=6e-3)
 
 
 # -- containers, options, output -------------------------------------------------------------

@@ -46,6 +46,10 @@ MATCH_FIELDS = tuple(
     for name, (dtype, offset, *_) in (MATCH_DTYPE.fields or {}).items()
 )
 
+# Size of a message [bytes] above which Fast DDS with its default transports loses it if it is sent
+# best effort: it does not fit into a segment of shared memory. A smaller value would warn of
+# images that arrive. [derived: the default segment of Fast DDS 2]
+LARGE_MESSAGE = 512 * 1024
 # Queue length of a pair topic. A shorter one loses pairs while a subscriber is busy; a longer one
 # costs memory alone. [chosen: three seconds of pairs at 30 Hz; one second to a minute would do]
 PAIR_HISTORY = 100

@@ -18,6 +18,7 @@ from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import ForceFault, length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
+from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
@@ -35,7 +36,10 @@ from rs_relpose_ros.pipeline.findings import (
 )
 from rs_relpose_ros.pipeline.findings_text import Text, text_of, with_sigma
 
-OK, UNKNOWN, SUSPECT, WRONG = FindingState
+OK = FindingState.OK
+UNKNOWN = FindingState.UNKNOWN
+SUSPECT = FindingState.SUSPECT
+WRONG = FindingState.WRONG
 
 
 class Line(NamedTuple):
@@ -229,13 +233,18 @@ def _parameters(parameters: Parameters) -> Line:
 
 # -- Images and their calibration -------------------------------------------------------------
 
-# Fast DDS with its default transports loses best-effort messages above this [bytes].
-_LARGE_MESSAGE = 512 * 1024
-# Below this [Hz] tracks are lost and keyframes lie far apart.
+# Rate of images [Hz] below which tracks are lost and keyframes lie far apart.
+# [chosen: 5 to 10 Hz would do]
 _SLOW = 8.0
+# Share of missed images that is reported. Below it no result suffers; above it a bag with frequent
+# losses would pass. [chosen: 0.02 to 0.1 would do]
 _MISSED_SHARE = 0.05
-# First stamps, enough to distinguish jitter from automatic exposure.
+# Number of first stamps by which jitter and automatic exposure are distinguished. Fewer leave the
+# correlation of the steps uncertain, more cost time alone. [chosen: 300 to 10,000 would do]
 _MOST_STAMPS = 1000
+# Share of repeated or unordered stamps from which stamps are no times of measurement.
+# [chosen: 0.1 to 0.4 would do; two publishers on a topic reach half]
+_UNORDERED_SHARE = 0.2
 
 
 def _no_step(name: Code, stamps: Stamps, measured: dict[str, Any]) -> Line:
@@ -272,7 +281,7 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
         text,
         measured,
         Case(
-            unordered > 0.2 * stamps.count,
+            unordered > _UNORDERED_SHARE * stamps.count,
             WRONG,
             f'have the driver of {of} stamp each message with its own time',
         ),
@@ -452,7 +461,7 @@ def _transport(scan: Scan, topic: Topic, reliability: str) -> Line:
         f'{topic.name} {offered}, up to {size / 1e3:.0f} kB per image',
         {'largest_bytes': size, 'reliability': reliability or None},
         Case(
-            size > _LARGE_MESSAGE,
+            size > LARGE_MESSAGE,
             SUSPECT,
             'live, Fast DDS loses most images above 512 KiB with '
             'its default transports: start driver and node with '
@@ -465,10 +474,16 @@ def _transport(scan: Scan, topic: Topic, reliability: str) -> Line:
 
 # -- Gyro and accelerometer -------------------------------------------------------------------
 
+# Rate of the IMU [Hz] below which the rotation within one readout is not resolved.
+# [chosen: 50 to 150 Hz would do]
 _SLOW_IMU = 80.0
-# Mean length of the specific force that is consistent with hand-held motion [m/s^2].
-_PLAUSIBLE_FORCE = (9.4, 10.8)
-# No hand and no drone rotates so fast in the median [rad/s]; degrees per second do.
+# Mean length of the specific force [m/s^2] that is consistent with hand-held motion. A wider range
+# would pass a scale that spoils baselines, a narrower one would report strong motion.
+# [chosen: gravity - 0.4 to gravity + 1, as mean lengths grow with acceleration]
+_LEAST_FORCE = 9.4
+_MOST_FORCE = 10.8
+# Median rate [rad/s] that neither a hand nor a drone reaches; degrees per second do.
+# [chosen: 5 to 20 would do]
 _FASTEST_MEDIAN = 8.0
 
 
@@ -485,55 +500,60 @@ def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Line]:
                 {},
             )
         ]
-    stamps, gap = scan.stamps(Role.IMU), parameters.imu.max_imu_gap
-    rate = _no_step(Code.IMU_RATE, stamps, {})
-    if stamps.interval > 0.0:
-        gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
-        hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
-        rate = by_case(
-            Code.IMU_RATE,
-            f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
-            f'{1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability),
-            {
-                'rate_hz': hertz,
-                'count': stamps.count,
-                'gaps': gaps,
-                'longest_step_s': longest,
-                'unusable': unusable,
-                'reliability': reliability or None,
-            },
-            Case(
-                stamps.interval > gap,
-                WRONG,
-                f'steps longer than max_imu_gap = {gap:g} s are '
-                'not interpolated: raise the rate to 100 Hz or more',
-            ),
-            Case(
-                unusable > 0,
-                SUSPECT,
-                'correct the driver',
-                f'; {unusable} messages cannot be used: {scan.problems.get(Role.IMU)}',
-            ),
-            Case(
-                gaps > 0,
-                SUSPECT,
-                "frames in a gap are refused: give the IMU's subscription a "
-                'deeper queue, or record on the machine of the driver',
-                f'; {gaps} gaps above {1e3 * gap:.0f} ms',
-            ),
-            Case(
-                hertz < _SLOW_IMU,
-                SUSPECT,
-                'publish 200 Hz or more, which resolves the rotation of a hand within one readout',
-            ),
-        )
+    stamps = scan.stamps(Role.IMU)
     return [
-        rate,
+        _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap),
         stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU'),
         _gyro(scan),
         _bias(scan, parameters),
         _accelerometer(scan),
     ]
+
+
+def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
+    """Line on the steps of the IMU; those above `gap` [s] are not interpolated."""
+    if not stamps.interval > 0.0:
+        return _no_step(Code.IMU_RATE, stamps, {})
+    gaps = int((stamps.forwards > gap).sum())
+    hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
+    recorded = f', recorded as {reliability}' if reliability else ''
+    return by_case(
+        Code.IMU_RATE,
+        f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
+        f'{1e3 * stamps.longest:.1f} ms{recorded}',
+        {
+            'rate_hz': hertz,
+            'count': stamps.count,
+            'gaps': gaps,
+            'longest_step_s': stamps.longest,
+            'unusable': unusable,
+            'reliability': reliability or None,
+        },
+        Case(
+            stamps.interval > gap,
+            WRONG,
+            f'steps longer than max_imu_gap = {gap:g} s are not interpolated: raise the rate to '
+            '100 Hz or more',
+        ),
+        Case(
+            unusable > 0,
+            SUSPECT,
+            'correct the driver',
+            f'; {unusable} messages cannot be used: {scan.problems.get(Role.IMU)}',
+        ),
+        Case(
+            gaps > 0,
+            SUSPECT,
+            "frames in a gap are refused: give the IMU's subscription a deeper queue, or record "
+            'on the machine of the driver',
+            f'; {gaps} gaps above {1e3 * gap:.0f} ms',
+        ),
+        Case(
+            hertz < _SLOW_IMU,
+            SUSPECT,
+            'publish 200 Hz or more, which resolves the rotation of a hand within one readout',
+        ),
+    )
 
 
 def _gyro(scan: Scan) -> Line:
@@ -615,7 +635,7 @@ def _accelerometer(scan: Scan) -> Line:
         },
         Case(bool(fault), WRONG, f'{ForceFault.fix}; or set use_gravity: false'),
         Case(
-            not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1],
+            not _LEAST_FORCE <= length <= _MOST_FORCE,
             SUSPECT,
             'calibrate the accelerometer (bias, scale), or set use_gravity: false',
             ', not near 9.81',
@@ -625,17 +645,28 @@ def _accelerometer(scan: Scan) -> Line:
 
 # -- Images and gyro together -----------------------------------------------------------------
 
-# Stamps of the two sensors that differ by more in their delay are of different clocks [s].
+# Difference of the delays of both sensors [s] from which their stamps are of different clocks.
+# Smaller would report slow drivers, larger would miss an offset that loses frames.
+# [chosen: 0.2 to 1 s would do]
 _SAME_CLOCK = 0.5
-# Matches of a pair in the median that give no estimate, and that are few.
-_NO_MATCHES, _FEW_MATCHES = 15, 30
-# Readout time that is assumed if none is known [s].
+# Matches of a pair in the median below which there is no estimate, and below which they are few.
+# [chosen: a solver samples 9 or 11 matches, and an inlier ratio is never 1]
+_NO_MATCHES = 15
+_FEW_MATCHES = 30
+# Readout time [s] that is assumed where none is known, for the effect alone.
+# [chosen: between phones, 10 to 20 ms, and webcams, 30 to 60 ms]
 _EXAMPLE_READOUT = 0.030
-# Displacement below the noise of matches, and one that spoils a global-shutter pose [px].
-_NO_EFFECT, _STRONG_EFFECT = 1.0, 4.0
-# Sigmas beyond which a deviation is certain, whether it matters for poses or not; and how many
-# times the largest sigma of an observable one it may reach before poses are wrong.
-_CERTAIN, _GROSS = 4.0, 3.0
+# Displacement [px] that is below the noise of matches, and one that spoils a global-shutter pose.
+# [chosen: about 2 and 8 sigmas of a match of 0.5 px]
+_NO_EFFECT = 1.0
+_STRONG_EFFECT = 4.0
+# Sigmas beyond which a deviation is certain, whether it matters for poses or not. Fewer would make
+# false alarms of seven quantities common, more would hide deviations that are plain to see.
+# [chosen: 4 sigmas are exceeded by chance once in 16,000; 3.5 to 5 would do]
+_CERTAIN = 4.0
+# Multiple of the largest sigma of an observable deviation from which poses are wrong.
+# [chosen: 2 to 5 would do]
+_GROSS = 3.0
 _MEASURE = 'measure it with "rs_relpose calibrate"'
 _READOUT = frozenset((Code.READOUT_TIME, Code.READOUT_DIRECTION))
 # Quantities by the parameters that set them.

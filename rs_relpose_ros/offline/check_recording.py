@@ -43,11 +43,15 @@ from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import warm_up
 from rs_relpose_ros.tracking.images import EncodedImage
 
-# Uncertainty of the bias before it is measured at rest, 1 sigma [rad/s]; the gate is four times
-# that.
+# Uncertainty of the bias before it is measured at rest, 1 sigma [rad/s]. Rates within four of it
+# can be rest: a smaller value would miss the rest of a sensor with a large bias, a larger one
+# would take slow rotation for rest. [chosen: data sheets of phones have 0.01 to 0.05]
 _BIAS_SIGMA = 0.03
-# Images that are decoded, evenly over the recording.
+# Number of images that are decoded, evenly over the recording. Fewer could miss a change of the
+# size; more cost time alone. [chosen: 10 to 200 would do]
 _DECODED = 40
+# Number of different encodings that are counted. It bounds the memory of a damaged recording.
+# [chosen: 5 to 1000 would do]
 _MOST_ENCODINGS = 20
 
 
@@ -158,25 +162,37 @@ class Scan:
         return rest if rest.sigma < _BIAS_SIGMA else None
 
 
-# Parts of consecutive images, evenly over the recording: three times 10 s at 30 Hz; and images of
-# a calibration.
-_PARTS, _PART_IMAGES, _CALIBRATED_IMAGES = 3, 300, 600
+# Number of parts of consecutive images, evenly over the recording, and of images in each: three
+# times 10 s at 30 Hz. Shorter parts have too few pairs to settle, more parts cost time.
+# [chosen: 2 to 5 parts of 200 to 600 images would do]
+_PARTS = 3
+_PART_IMAGES = 300
+# Number of images of a calibration. Fewer leave quantities unobserved, more cost time.
+# [chosen: 20 s at 30 Hz; docs/calibration.md recommends 20 to 60 s]
+_CALIBRATED_IMAGES = 600
 # A part is evaluated by its last pair, and by those so long after its first one: fewer pairs are
-# easily misled.
+# easily misled. [chosen: half to twice of it would do; the window of the monitor is 20 s]
 _SETTLED_NS = to_nanoseconds(10.0)
-# Pairs so far apart are of two parts.
+# Pairs so far apart are of two parts. [chosen: between the longest interval of keyframes, 1 s, and
+# the distance of two parts]
 _APART_NS = to_nanoseconds(3.0)
-# Share of the images below which hardly any was used.
+# Share of the images below which hardly any was used. [chosen: 0.02 to 0.3 would do]
 _FEW_USED = 0.1
-# Share of the pairs that have a pose if the camera moves and is correctly configured.
+# Share of the pairs that have a pose if the camera moves and is correctly configured. A larger one
+# would calibrate each bag with rests again, a smaller one would miss a large deviation.
+# [chosen: 0.5 to 0.8 would do]
 _MOST_POSED = 0.7
 # Quantities whose large deviations are detected, but not measured.
 _FAR_OFF = frozenset((Code.AXES, Code.TIME_OFFSET, Code.IMAGE_GEOMETRY))
-# Largest number of images that wait for the gyro: if the clocks differ it never comes.
+# Largest number of images that wait for the gyro: if the clocks differ it never comes. It bounds
+# the memory. [chosen: above the delay of an IMU, 0.5 s, at 60 Hz; 32 to 256 would do]
 _MOST_WAITING = 64
-# Sigmas beyond which a calibration contradicts the configuration, and least differences [rad, s].
+# Sigmas beyond which a calibration contradicts the configuration. [chosen: as in `check`]
 _CERTAIN = 4.0
-_LEAST_ANGLE, _LEAST_TIME = math.radians(5.0), 8e-3
+# Least angle [rad] and time [s] of such a contradiction: smaller ones the monitor measures better.
+# [chosen: above the errors of a calibration of 20 s, below the reach of the monitor]
+_LEAST_ANGLE = math.radians(5.0)
+_LEAST_TIME = 8e-3
 
 
 class Completion(NamedTuple):
@@ -346,36 +362,19 @@ def sampled(
         {'withhold_when_wrong': False, 'track_time_offset': False, 'track_readout_time': False}
     )
     front_end = FrontEnd(parameters, offline=True)
-    # Indices of the first images of the parts, which overlap in a short recording.
-    firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1) for part in range(_PARTS)]
-    unused, poseless, matches, poses = ReasonCounts(), ReasonCounts(), list[int](), 0
-    handed = done = frames = part_since_ns = last_ns = 0
+    counts: Counter[str] = Counter()  # of images: handed to the front end, and done there
+    unused = ReasonCounts()
+    chosen = _of_parts(source, front_end, images, counts, unused)
+    poseless, matches, poses = ReasonCounts(), list[int](), 0
+    frames = part_since_ns = last_ns = 0
     before = findings.NOT_EVALUATED  # of the settled parts
-
-    def chosen() -> Iterator[tuple[Role, BagMessage]]:
-        """The messages without the images that belong to no part."""
-        nonlocal handed
-        index = -1
-        for role, message in source:
-            index += role is Role.IMAGE
-            if role is Role.IMAGE and (
-                handed - done >= _MOST_WAITING
-                or not any(0 <= index - first < _PART_IMAGES for first in firsts)
-            ):
-                try:
-                    front_end.sequencer.pass_over(stamp_ns(message.message.header))
-                except RsRelposeError as error:
-                    unused.add(str(error))
-                continue
-            handed += role is Role.IMAGE
-            yield role, message
-
-    for outcome in outcomes(front_end, Intake(front_end.sequencer, parameters), chosen()):
-        done += not isinstance(outcome, MessageRefused)
+    for outcome in outcomes(front_end, Intake(front_end.sequencer, parameters), chosen):
+        if isinstance(outcome, MessageRefused):
+            unused.add(str(outcome.error))
+            continue
+        counts['done'] += 1
         if not isinstance(outcome, Frame):
-            unused.add(
-                str(outcome.error) if isinstance(outcome, MessageRefused) else outcome.reason
-            )
+            unused.add(outcome.reason)
             continue
         frames += 1
         if (pair := outcome.result) is None:
@@ -389,11 +388,33 @@ def sampled(
             before = findings.worst_of(before, front_end.health)
         matches.append(len(pair.matches))
         last_ns = pair.stamp_ns
-    return Sample(
-        frames,
-        matches,
-        poses,
-        poseless if matches else unused,
-        findings.worst_of(before, front_end.health),
-        frames < _FEW_USED * handed,
-    )
+    health = findings.worst_of(before, front_end.health)
+    is_refused = frames < _FEW_USED * counts['handed']
+    return Sample(frames, matches, poses, poseless if matches else unused, health, is_refused)
+
+
+def _of_parts(
+    source: Iterable[tuple[Role, BagMessage]],
+    front_end: FrontEnd,
+    images: int,
+    counts: Counter[str],
+    unused: ReasonCounts,
+) -> Iterator[tuple[Role, BagMessage]]:
+    """The messages without the images that belong to no part, or for which too many wait."""
+    # Indices of the first images of the parts, which overlap in a short recording.
+    firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1) for part in range(_PARTS)]
+    index = -1
+    for role, message in source:
+        if role is not Role.IMAGE:
+            yield role, message
+            continue
+        index += 1
+        is_in_part = any(0 <= index - first < _PART_IMAGES for first in firsts)
+        if is_in_part and counts['handed'] - counts['done'] < _MOST_WAITING:
+            counts['handed'] += 1
+            yield role, message
+            continue
+        try:
+            front_end.sequencer.pass_over(stamp_ns(message.message.header))
+        except RsRelposeError as error:
+            unused.add(str(error))
