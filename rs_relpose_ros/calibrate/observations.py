@@ -464,27 +464,18 @@ def find_starts(
         if inside.sum() < max(10, 0.5 * len(rates)):
             return None
         begin, end = begins[inside] + offset, ends[inside] + offset
-        measured = np.stack(
-            [
-                (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
-                / (end - begin)
-                for of_axis in turned.T
-            ],
-            axis=1,
-        )
-        return min(
-            (
-                _aligned(
-                    rates[inside] * [1.0 / factor, 1.0 / factor, 1.0],
-                    measured,
-                    offset,
-                    float(factor),
-                    R_prior,
-                )
-                for factor in np.atleast_1d(factors)
-            ),
-            key=lambda start: start.misfit,
-        )
+        measured = _mean_rates(turned, gyro_times, begin, end)
+        starts = [
+            _aligned(
+                rates[inside] * [1.0 / factor, 1.0 / factor, 1.0],
+                measured,
+                offset,
+                float(factor),
+                R_prior,
+            )
+            for factor in np.atleast_1d(factors)
+        ]
+        return min(starts, key=lambda start: start.misfit)
 
     # The best offsets hardly depend on the focal length.
     offsets = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
@@ -499,6 +490,12 @@ def find_starts(
         filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
         key=lambda start: start.misfit,
     )
+
+
+def _mean_rates(turned: Array, times: Array, begin: Array, end: Array) -> Array:
+    """Mean rates (P, 3) between times (P,) by the angles `turned` (K, 3) at the `times` (K,)."""
+    angles = [np.interp(end, times, axis) - np.interp(begin, times, axis) for axis in turned.T]
+    return np.stack([one / (end - begin) for one in angles], axis=1)
 
 
 def _aligned(

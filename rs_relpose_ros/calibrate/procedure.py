@@ -72,7 +72,6 @@ def calibrate(
     """
     config = CalibrationConfig() if config is None else config
     R_prior = None if quat_prior is None else Rotation.from_quat(quat_prior).as_matrix()
-    rng = np.random.default_rng(rng)
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(
             f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
@@ -85,6 +84,22 @@ def calibrate(
     def about(lens: Array) -> Observations:
         return data if not lens.any() else Observations.of(tracks, gyro, camera, config, lens)
 
+    return _calibrated(about, R_prior, focal_known, config, np.random.default_rng(rng), progress)
+
+
+def _calibrated(
+    about: Callable[[Array], Observations],
+    R_prior: Array | None,
+    focal_known: bool,
+    config: CalibrationConfig,
+    rng: np.random.Generator,
+    progress: Callable[[float], object],
+) -> CalibrationResult:
+    """The calibration of a usable recording: coarse, with some pairs, then with all pairs.
+
+    `about` gives the observations with a deviation of the lens.
+    """
+    data = about(np.zeros(len(model.LENS_BASIS.T)))
     free = np.ones(model.GLOBAL, dtype=bool)
     free[[model.SLOPE, model.EXPOSURE]] = free[model.LENS] = False
     free[model.FOCAL] = not focal_known
@@ -321,47 +336,27 @@ def evaluated(
     sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
     if fit.move_of_poses(final, covariance) <= 1.0:
         wide = max(wide, config.unnoticed_tolerance)
-    # Row 0 is read this share of the readout before the middle row.
-    to_first, height = np.zeros(model.GLOBAL), data.camera.height
-    to_first[[model.OFFSET, model.READOUT]] = 1.0, -0.5 * (height - 1) / height
-    rotation_sigma = sigmas[model.ROTATION]
     axis_map = observations.nearest_axis_map(R_cam_imu)
-    cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
 
     def of(k: int) -> Estimate:
         return _estimate(parameters[k], sigmas[k], wide * _MOST[k])
 
-    slope = lens = None
-    if final.free[model.FOCAL]:
-        camera = data.camera.moved_lens(model.LENS_BASIS @ parameters[model.LENS])
-        focal, *others = sigmas[model.LENS]
-        factor = math.exp(data.lens[0] + parameters[model.FOCAL])
-        lens = LensEstimates(
-            _estimate(factor, factor * focal, factor * wide * _MOST[model.FOCAL], one_axis),
-            *(
-                Estimate(value, float(sigma), True)
-                for value, sigma in zip(
-                    (camera.distortion[0], camera.cx, camera.cy), others, strict=True
-                )
-            ),
-        )
+    slope = None
     if final.free[model.SLOPE]:
         slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
     jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
+    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying))
+    lens = _lens(data, parameters, sigmas, wide, one_axis) if final.free[model.FOCAL] else None
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         fitted_readout=float(unknowns.parameters[model.READOUT]),
-        time_offset=_estimate(
-            float(to_first @ parameters),
-            math.sqrt(to_first @ covariance @ to_first),
-            wide * _MOST[model.OFFSET],
-        ),
+        time_offset=_offset_of_row_0(data, parameters, covariance, wide),
         R_cam_imu=R_cam_imu,
-        rotation_sigma=rotation_sigma,
+        rotation_sigma=sigmas[model.ROTATION],
         rotation=_estimate(
-            math.acos(np.clip(cosine, -1.0, 1.0)),
-            rotation_sigma.max(),
+            _angle_between(R_cam_imu, axis_map),
+            sigmas[model.ROTATION].max(),
             wide * config.max_rotation_sigma,
             '' if axes_known else one_axis,
         ),
@@ -381,9 +376,42 @@ def evaluated(
         pairs=final.problem.pairs,
         matches=int(final.problem.begin[-1]),
         frame_interval=data.interval,
-        warnings=tuple(
-            filter(None, (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying)))
-        ),
+        warnings=tuple(filter(None, notes)),
+    )
+
+
+def _offset_of_row_0(
+    data: Observations, parameters: Array, covariance: Array, wide: float
+) -> Estimate:
+    """Time offset of row 0, which is read half of the readout before the middle row."""
+    height = data.camera.height
+    by_parameters = np.zeros(model.GLOBAL)
+    by_parameters[model.OFFSET] = 1.0
+    by_parameters[model.READOUT] = -0.5 * (height - 1) / height
+    value = float(by_parameters @ parameters)
+    sigma = math.sqrt(by_parameters @ covariance @ by_parameters)
+    return _estimate(value, sigma, wide * _MOST[model.OFFSET])
+
+
+def _angle_between(first: Array, second: Array) -> float:
+    """Angle [rad] of the rotation between two rotation matrices (3, 3)."""
+    cosine = (np.trace(first @ second.T) - 1.0) / 2.0
+    return math.acos(np.clip(cosine, -1.0, 1.0))
+
+
+def _lens(
+    data: Observations, parameters: Array, sigmas: Array, wide: float, one_axis: str
+) -> LensEstimates:
+    """Estimates of the lens; the focal length is not observable by a rotation about one axis."""
+    camera = data.camera.moved_lens(model.LENS_BASIS @ parameters[model.LENS])
+    focal_sigma, radial_sigma, column_sigma, row_sigma = map(float, sigmas[model.LENS])
+    factor = math.exp(data.lens[0] + parameters[model.FOCAL])
+    most = factor * wide * _MOST[model.FOCAL]
+    return LensEstimates(
+        _estimate(factor, factor * focal_sigma, most, one_axis),
+        Estimate(camera.distortion[0], radial_sigma, True),
+        Estimate(camera.cx, column_sigma, True),
+        Estimate(camera.cy, row_sigma, True),
     )
 
 

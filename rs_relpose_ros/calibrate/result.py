@@ -127,20 +127,30 @@ _BIAS_CHANGE = 1e-3
 _MS = 1e3
 
 
-def quantities(
-    result: CalibrationResult, camera: RollingShutterCamera
-) -> list[tuple[str, str, Estimate]]:
+# A quantity of the report: its name, its value with 1 sigma in words, and its estimate.
+_Quantity = tuple[str, str, Estimate]
+
+
+def quantities(result: CalibrationResult, camera: RollingShutterCamera) -> list[_Quantity]:
     """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
-    readout, exposure = result.readout_time, result.exposure
+    return [
+        *_clock_quantities(result),
+        *_motion_quantities(result),
+        *_exposure_quantities(result),
+        *_lens_quantities(result, camera),
+    ]
+
+
+def _clock_quantities(result: CalibrationResult) -> list[_Quantity]:
+    """Readout time and time offset, and what the offset varies with."""
+    readout = result.readout_time
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    direction = ', read upwards' if readout.value < 0.0 else ''
+    text = _shown('readout_time', readout, abs(readout.value)) + direction
+    offset = result.time_offset
     rows = [
-        (
-            'readout time',
-            _shown('readout_time', readout, abs(readout.value))
-            + (', read upwards' if readout.value < 0.0 else ''),
-            readout,
-        ),
-        ('time offset (row 0)', _shown('time_offset', result.time_offset), result.time_offset),
+        ('readout time', text, readout),
+        ('time offset (row 0)', _shown('time_offset', offset), offset),
     ]
     if slope is not None:
         text = (
@@ -155,42 +165,51 @@ def quantities(
             'exposure'
         )
         rows.append(('jitter of stamps', text, jitter))
+    return rows
+
+
+def _motion_quantities(result: CalibrationResult) -> list[_Quantity]:
+    """Rotation between IMU and camera, and the bias of the gyro."""
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     text = (
         f'{axes_text(result.axis_map)}, and {np.degrees(result.rotation.value):.2f} deg off '
         f"it; 1 sigma about the camera's x, y, z: {sigmas} deg"
     )
-    rows += [
-        ('rotation IMU to camera', text, result.rotation),
-        *(
-            (f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
-            for axis, bias in zip('xyz', result.gyro_bias, strict=True)
-        ),
+    biases = [
+        (f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
+        for axis, bias in zip('xyz', result.gyro_bias, strict=True)
     ]
-    if exposure.sigma:
-        text = (
-            f'{_rounded(exposure, 1, _MS)} ms at the median interval, over which the gyro is '
-            'averaged'
+    return [('rotation IMU to camera', text, result.rotation), *biases]
+
+
+def _exposure_quantities(result: CalibrationResult) -> list[_Quantity]:
+    """The exposure, where it was estimated."""
+    exposure, margin = result.exposure, _MS * result.exposure_margin
+    if not exposure.sigma:
+        return []
+    text = (
+        f'{_rounded(exposure, 1, _MS)} ms at the median interval, over which the gyro is averaged'
+    )
+    if margin:
+        text += (
+            f' (assumed: the interval less {margin:.0f} ms, as automatic exposure lengthens it)'
         )
-        if result.exposure_margin:
-            text += (
-                f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
-                'automatic exposure lengthens it)'
-            )
-        rows.append(('exposure', text, exposure))
-    if result.lens is not None:
-        focal, radial, column, row = result.lens
-        text = f'{_rounded(radial, 3)} (first coefficient of {camera.distortion_model})'
-        rows += [
-            (
-                'focal length',
-                with_sigma(Code.FOCAL_LENGTH, camera.fx * focal.value, camera.fx * focal.sigma),
-                focal,
-            ),
-            ('distortion', text, radial),
-            ('principal point', f'{_rounded(column, 1)}, {_rounded(row, 1)} px', column),
-        ]
-    return rows
+    return [('exposure', text, exposure)]
+
+
+def _lens_quantities(result: CalibrationResult, camera: RollingShutterCamera) -> list[_Quantity]:
+    """The lens, where it was estimated."""
+    if result.lens is None:
+        return []
+    focal, radial, column, row = result.lens
+    length = with_sigma(Code.FOCAL_LENGTH, camera.fx * focal.value, camera.fx * focal.sigma)
+    coefficient = f'{_rounded(radial, 3)} (first coefficient of {camera.distortion_model})'
+    place = f'{_rounded(column, 1)}, {_rounded(row, 1)} px'
+    return [
+        ('focal length', length, focal),
+        ('distortion', coefficient, radial),
+        ('principal point', place, column),
+    ]
 
 
 def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
@@ -289,35 +308,59 @@ def _sigma(name: str, value: float, digits: int, source: str = '') -> _Parameter
     return f'{name}_sigma', max(round(value, digits), 10.0**-digits), source
 
 
-def _parameters(result: CalibrationResult) -> Iterator[tuple[Estimate, str, list[_Parameter]]]:
-    """Estimate, main parameter and all parameters of each quantity but the lens."""
-    readout, offset, exposure = result.readout_time, result.time_offset, result.exposure
-    slope, biases, shutter = result.offset_by_interval, result.gyro_bias, _shutter_text(result)
+# Estimate, main parameter, and all parameters of a quantity.
+_Group = tuple[Estimate, str, list[_Parameter]]
+
+
+def _parameters(result: CalibrationResult) -> Iterator[_Group]:
+    """Groups of parameters of all quantities but the lens."""
+    yield _readout_parameters(result)
+    yield result.time_offset, 'time_offset', _clock_parameters(result)
+    off = f'{np.degrees(result.rotation.value):.2f} deg off.'
+    quat_xyzw = tuple(round(value, 7) for value in result.quat_cam_imu_xyzw)
+    axes: list[_Parameter] = [
+        ('quat_cam_imu_xyzw', quat_xyzw, f'{axes_text(result.axis_map)}, {off}'),
+        _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].'),
+    ]
+    yield result.rotation, 'quat_cam_imu_xyzw', axes
+    biases = result.gyro_bias
+    sigmas = ', '.join(f'{bias.sigma:.5f}' for bias in biases)
+    restart = f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.'
+    bias_values = tuple(round(bias.value, 5) for bias in biases)
+    bias: list[_Parameter] = [
+        ('gyro_bias', bias_values, f'1 sigma {sigmas} rad/s.'),
+        _sigma('gyro_bias', result.bias_sigma, 5, restart),
+    ]
+    yield max(biases, key=lambda one: one.sigma), 'gyro_bias', bias
+
+
+def _readout_parameters(result: CalibrationResult) -> _Group:
+    readout, shutter = result.readout_time, _shutter_text(result)
     rolling = result.shutter != 'global'
     source = (
         f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
         f'sigma); at most the {_MS * result.frame_interval:.1f} ms between frames.'
     )
-    yield (
-        readout,
-        'readout_time',
-        [
-            ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
-            _sigma('readout_time', readout.sigma, 6),
-            (
-                'readout_direction',
-                'up' if rolling and readout.value < 0.0 else 'down',
-                'By the sign of that estimate.',
-            ),
-        ],
-    )
-    clock: list[_Parameter] = [
+    upwards = rolling and readout.value < 0.0
+    direction = 'up' if upwards else 'down'
+    values: list[_Parameter] = [
+        ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
+        _sigma('readout_time', readout.sigma, 6),
+        ('readout_direction', direction, 'By the sign of that estimate.'),
+    ]
+    return readout, 'readout_time', values
+
+
+def _clock_parameters(result: CalibrationResult) -> list[_Parameter]:
+    """Offset of the clocks, what it varies with, and the exposure."""
+    offset, slope, exposure = result.time_offset, result.offset_by_interval, result.exposure
+    values: list[_Parameter] = [
         ('stamp_row', 'first', 'Convention of time_offset here.'),
         ('time_offset', round(offset.value, 6), 'To the middle of the exposure of row 0.'),
         _sigma('time_offset', offset.sigma, 6),
     ]
     if slope is not None:
-        clock += [
+        values += [
             ('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
             _sigma('time_offset_per_interval', slope.sigma, 4),
             (
@@ -332,41 +375,11 @@ def _parameters(result: CalibrationResult) -> Iterator[tuple[Estimate, str, list
             f'Exposure {_rounded(exposure, 1, _MS)} ms at that interval, assumed as '
             f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.'
         )
-        clock.append(('exposure_margin', round(margin, 5), source))
+        values.append(('exposure_margin', round(margin, 5), source))
     elif exposure.value > 2.0 * exposure.sigma:
-        clock.append(
-            ('exposure_time', round(exposure.value, 5), f'1 sigma {_MS * exposure.sigma:.1f} ms.')
-        )
-    yield offset, 'time_offset', clock
-    yield (
-        result.rotation,
-        'quat_cam_imu_xyzw',
-        [
-            (
-                'quat_cam_imu_xyzw',
-                tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
-                f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off.',
-            ),
-            _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].'),
-        ],
-    )
-    yield (
-        max(biases, key=lambda bias: bias.sigma),
-        'gyro_bias',
-        [
-            (
-                'gyro_bias',
-                tuple(round(bias.value, 5) for bias in biases),
-                f'1 sigma {", ".join(f"{bias.sigma:.5f}" for bias in biases)} rad/s.',
-            ),
-            _sigma(
-                'gyro_bias',
-                result.bias_sigma,
-                5,
-                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.',
-            ),
-        ],
-    )
+        source = f'1 sigma {_MS * exposure.sigma:.1f} ms.'
+        values.append(('exposure_time', round(exposure.value, 5), source))
+    return values
 
 
 def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[_Parameter]:
