@@ -18,6 +18,7 @@ from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
+from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
 from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -26,19 +27,23 @@ from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
 # -- Reasons for no results or few images ---------------------------------------------------------
 
-# Time without a result [s] after which the reason is logged.
+# Time without a result [s] after which the reason is logged. Less would log each short rest of the
+# camera, more would leave a user waiting. [chosen: 2 to 10 s would do]
 PATIENCE = 5.0
-# Share of the images whose refusal is the reason for no result.
+# Share of the images whose refusal is the reason for no result. A smaller one would name refusals
+# beside which pairs without a pose are the true reason. [chosen: 0.6 to 0.95 would do]
 _MOST = 0.8
-# Share of the images of an even rhythm below which images are lost, and fewest that show it.
-_LOST, _FEWEST = 0.7, 10
-# With its default transports Fast DDS loses best-effort messages above this size [bytes], which do
-# not fit into its segment of shared memory.
-_BIG = 512 * 1024
+# Share of the images of an even rhythm below which images are lost, and fewest images that show
+# it. [chosen: transport that works loses a few per cent, Fast DDS with large messages most]
+_LOST = 0.7
+_FEWEST = 10
 _COMPRESSED = '/compressed'
-# Jitter of stamps that is reported [s], and the correlation of successive intervals below which
-# it is jitter, not an exposure that changes.
-_JITTER, _ALTERNATING = 5e-4, -0.15
+# Jitter of stamps that is reported [s]. At 1 rad/s and f = 500 px it displaces points by 0.25 px,
+# half the noise of a match. [derived: from that; half and double of it would do]
+_JITTER = 5e-4
+# Correlation of successive intervals below which they vary by jitter, not by an exposure that
+# changes. [derived: independent errors of stamps have -0.5, a slow change has above 0]
+_ALTERNATING = -0.15
 
 
 class Reason(NamedTuple):
@@ -111,7 +116,7 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
     # A quarter of the intervals has no lost image between, unless most images are lost.
     period = max(float(np.quantile(steps, 0.25, method='lower')), 1e-9)
     sent = 1e-9 * (recent[-1] - recent[0]) / period + 1.0
-    if size >= _BIG and len(recent) < _LOST * sent:
+    if size >= LARGE_MESSAGE and len(recent) < _LOST * sent:
         return (
             f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
             f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. '
@@ -135,15 +140,21 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
 
 # -- Fields of /diagnostics -----------------------------------------------------------------------
 
-OK, WARN, ERROR = 0, 1, 2
+# Levels of diagnostic_msgs/DiagnosticStatus.
+OK = 0
+WARN = 1
+ERROR = 2
 STARTING = 'starting: kernels are compiled or loaded'
 # Task in the name of the status of relpose_node.
 RELATIVE_POSE = 'relative pose'
 
-# Numbers of the latest results and frames over which latency and time per frame are taken.
+# Numbers of the latest results and frames over which latency and time per frame are taken: half a
+# minute. Fewer leave the 99th percentile to three values, more hide a change.
+# [chosen: half to four times would do]
 _RECENT_RESULTS = 300
 _RECENT_FRAMES = 900
-# Time without a message [s] after which an input counts as missing.
+# Time without a message [s] after which an input counts as missing. Less would report slow
+# cameras. [chosen: 1 to 5 s would do]
 SILENCE = 2.0
 # Topics of the nodes in the order of /diagnostics, and the key of unusable messages.
 TOPICS = (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
@@ -267,38 +278,45 @@ class FrameStatistics(ABC):
             )
             if warning and level == OK:
                 level, text = WARN, warning
-            values: dict[str, object] = {
-                'state': self.idle
-                if problem
-                else {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
-                'missing': ', '.join(missing),
-            }
+            state = (
+                self.idle if problem else {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level]
+            )
+            values: dict[str, object] = {'state': state, 'missing': ', '.join(missing)}
             if progress is not None:
-                values.update(
-                    state='calibrating',
-                    progress=f'{100.0 * progress.share:.0f}',
-                    **progress.values,
-                )
+                share = f'{100.0 * progress.share:.0f}'
+                values.update(state='calibrating', progress=share, **progress.values)
             for role in TOPICS:
                 rate = (inputs[role] - before[role]) / elapsed
                 values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
             values['frames_received'] = counts.frames if counts else inputs[Role.IMAGE]
             values['frames_processed'] = taken
-            for kind in Refusal:
-                values[f'frames_refused_{kind.value}'] = refused[kind]
-            values['frames_failed'] = self._failures
-            values['messages_invalid'] = inputs[INVALID]
-            for name in _COUNTERS:
-                values[name] = getattr(counts, name, 0)
-            values.update(self._values())
-            for name, seconds in (('latency', self._latencies), ('frame_time', self._frame_times)):
-                values[f'{name}_p50_ms'], values[f'{name}_p99_ms'] = _milliseconds(seconds)
+            values |= self._counters(counts, refused, inputs[INVALID])
+            values |= self._values()
+            values |= self._times()
             values['worker_busy_percent'] = f'{100.0 * busy:.0f}'
             values[self.last] = self._last_failure.text if self._last_failure else ''
             silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
         return Report(
             level, text, tuple((name, str(value)) for name, value in values.items()), silence
         )
+
+    def _counters(
+        self, counts: SequencerCounts | None, refused: Counter[Refusal], invalid: int
+    ) -> dict[str, object]:
+        """Numbers of frames and samples that were not used, and why."""
+        values: dict[str, object] = {
+            f'frames_refused_{kind.value}': refused[kind] for kind in Refusal
+        }
+        values['frames_failed'] = self._failures
+        values['messages_invalid'] = invalid
+        return values | {name: getattr(counts, name, 0) for name in _COUNTERS}
+
+    def _times(self) -> dict[str, object]:
+        """Latency of the latest results, and processing time of the latest frames."""
+        values: dict[str, object] = {}
+        for name, seconds in (('latency', self._latencies), ('frame_time', self._frame_times)):
+            values[f'{name}_p50_ms'], values[f'{name}_p99_ms'] = _milliseconds(seconds)
+        return values
 
     def _silence(self, now_ns: int, images: int, refused: Counter[Refusal]) -> Silence:
         # Without an image there can be no result.

@@ -29,14 +29,22 @@ NAME = 'odometry_node'
 
 # Topic of the pairs, below the node's namespace.
 _PAIRS = 'relpose_node/pairs'
-_IMU_DEPTH, _DEPTH = 2000, 50
-# Lowest rate at which the IMU is read [Hz]; the published rate may be lower.
+# Queue lengths of the IMU and of other topics. The IMU is read at `_LEAST_RATE` or faster, but not
+# while a pair is added: a shorter queue would lose samples of a slow machine, a longer one costs
+# memory. [chosen: 10 s at 200 Hz, and 5 s of pairs at 10 Hz]
+_IMU_DEPTH = 2000
+_DEPTH = 50
+# Lowest rate [Hz] at which the IMU is read; the published rate may be lower. A lower one would
+# make the silence of the IMU known late. [chosen: 4 to 50 Hz would do]
 _LEAST_RATE = 10.0
-# Newest keyframes of ~/path.
+# Number of newest keyframes on ~/path. More make a message larger than RViz draws at 1 Hz.
+# [chosen: some minutes of keyframes; 500 to 10,000 would do]
 _PATH_LENGTH = 3000
 # Reports (one a second) without a message after which a topic counts as silent.
+# [chosen: 2 to 5 would do; the first report comes at any time within its second]
 _SILENCE = 2
-# Time without a sample after which the IMU is silent [s].
+# Time without a sample after which the IMU is silent [s]. Less would report a burst of delayed
+# samples, more would propagate a path without an IMU. [chosen: 0.1 to 0.5 s would do]
 _SILENT_IMU = 0.25
 # Level of diagnostic_msgs/DiagnosticStatus by state.
 _LEVELS = {
@@ -113,57 +121,34 @@ class OdometryNode(StoppableNode):
         self._info(f'ready: {" and ".join(self._silent)}')
 
     def _open_topics(self) -> None:
-        overridable = QoSOverridingOptions.with_default_policies
         self._odometry, self._keyframes = (
             self.create_publisher(
                 message_class('nav_msgs/msg/Odometry'),
                 topic,
                 QoSProfile(depth=_DEPTH),
-                qos_overriding_options=overridable(),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
             for topic in ('~/odometry', '~/keyframes')
         )
         self._path_topic = self.create_publisher(message_class('nav_msgs/msg/Path'), '~/path', 1)
 
-        def polled(
-            topic: str,
-            msgtype: str,
-            qos: QoSProfile,
-            receive: Callable[[Any], None],
-        ) -> PolledSubscription:
-            def receive_all(messages: list[Any]) -> None:
-                for message in messages:
-                    receive(message)
-
-            return PolledSubscription(
-                self,
-                message_class(msgtype),
-                topic,
-                qos,
-                receive_all,
-                lambda: False,
-                qos_overriding_options=overridable(),
-            )
-
+        samples = inputs.best_effort(_IMU_DEPTH)
         # Read as often as odometry is published: each message would wake the process.
-        # Of CameraInfo whether the camera still delivers where no pair comes.
         self._inputs = [
             *(
-                polled(
-                    role.value,
-                    PARTS[role].msgtypes[0],
-                    inputs.best_effort(_IMU_DEPTH),
-                    partial(self._on_sample, role),
+                self._polled(
+                    role.value, PARTS[role].msgtypes[0], samples, partial(self._on_sample, role)
                 )
                 for role in (Role.IMU, Role.ACCEL)
             ),
-            polled(
+            # CameraInfo shows whether the camera still delivers where no pair comes.
+            self._polled(
                 Role.CAMERA_INFO.value,
                 'sensor_msgs/msg/CameraInfo',
                 inputs.best_effort(_DEPTH),
                 lambda info: self._estimator.add_frame(stamp_ns(info.header)),
             ),
-            polled(
+            self._polled(
                 _PAIRS,
                 'diagnostic_msgs/msg/DiagnosticArray',
                 QoSProfile(depth=outgoing.PAIR_HISTORY),
@@ -173,6 +158,25 @@ class OdometryNode(StoppableNode):
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
+
+    def _polled(
+        self, topic: str, msgtype: str, qos: QoSProfile, receive: Callable[[Any], None]
+    ) -> PolledSubscription:
+        """A subscription that `_read` empties; `receive` gets each message."""
+
+        def receive_all(messages: list[Any]) -> None:
+            for message in messages:
+                receive(message)
+
+        return PolledSubscription(
+            self,
+            message_class(msgtype),
+            topic,
+            qos,
+            receive_all,
+            lambda: False,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Restart at the origin; counters stay."""

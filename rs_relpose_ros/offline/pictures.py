@@ -116,87 +116,60 @@ def draw_rotation(
     records: Sequence[PairRecord], path: Path, truth: TrueTrajectory | None = None
 ) -> None:
     """Rotation accumulated over the pairs, against the ground truth or else the gyro."""
-    unknown = np.full((3, 3), np.nan)
-    gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
-    # A pair without a rotation is bridged by the gyro, and its span is shaded.
-    chains = {
-        'estimated': _accumulated(
-            [
-                g if np.isnan(r.pose.R).any() else r.pose.R
-                for r, g in zip(records, gyro, strict=True)
-            ]
-        ),
-        'gyro alone': _accumulated(gyro),
-    }
-    against = 'gyro alone'
-    if truth is not None:
-        poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
-        against = 'ground truth'
-        chains[against] = _accumulated([unknown if pose is None else pose[0] for pose in poses])
+    chains = _chains(records, truth)
+    against = list(chains)[-1]  # the ground truth, or else the gyro
     start_ns = records[0].reference_ns1
     times = [0.0, *_spans(records, start_ns)[1]]
     picture = _over_time(
         2, 'orientation against the first keyframe: the rotations of the pairs, chained'
     )
     above, below = picture.axes
-    # Rotation vectors (N, 3) [deg].
-    estimated, reference = (
-        np.degrees(
-            [
-                Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else np.full(3, np.nan)
-                for R in chains[name]
-            ]
-        )
-        for name in ('estimated', against)
-    )
-    for column, color in enumerate((BLUE, RED, GREEN)):
-        above.plot(
-            times,
-            estimated[:, column],
-            'o-',
-            color=color,
-            markersize=3,
-            linewidth=1.6,
-            label=f'{"xyz"[column]} ({("right", "down", "forward")[column]})',
-        )
-        above.plot(
-            times,
-            reference[:, column],
-            '--',
-            color='black',
-            linewidth=1.0,
-            label=against if column == 2 else None,
-        )
+    estimated, reference = _vectors(chains['estimated']), _vectors(chains[against])
+    for column, (color, name) in enumerate(
+        ((BLUE, 'x (right)'), (RED, 'y (down)'), (GREEN, 'z (forward)'))
+    ):
+        above.plot(times, estimated[:, column], 'o-', color=color, label=name, markersize=3)
+        label = against if column == 2 else None
+        above.plot(times, reference[:, column], '--', color='black', linewidth=1.0, label=label)
     above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
     for (name, chain), color in zip(chains.items(), (BLUE, ORANGE), strict=False):
         if name != against:
-            angles = [
-                rotation_angle(R.T @ R_against)
-                for R, R_against in zip(chain, chains[against], strict=True)
-            ]
-            below.plot(
-                times,
-                angles,
-                'o-',
-                color=color,
-                markersize=3,
-                linewidth=1.4,
-                label=f'{name} against {against}',
-            )
+            pairs = zip(chain, chains[against], strict=True)
+            angles = [rotation_angle(R.T @ R_against) for R, R_against in pairs]
+            label = f'{name} against {against}'
+            below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4, label=label)
     below.set_ylabel('difference, accumulated\n[deg]')
-    below.set_title(
-        'drift of the chain: errors of pairs accumulate, as in any odometry',
-        fontsize=9,
-        loc='left',
-    )
+    title = 'drift of the chain: errors of pairs accumulate, as in any odometry'
+    below.set_title(title, fontsize=9, loc='left')
     below.set_ylim(bottom=0.0)
-    _shade_no_pose(
-        below,
-        [r for r in records if np.isnan(r.pose.R).any()],
-        start_ns,
-        'no rotation: gyro instead',
-    )
+    bridged = [record for record in records if np.isnan(record.pose.R).any()]
+    _shade_no_pose(below, bridged, start_ns, 'no rotation: gyro instead')
     _save_over_time(picture, path)
+
+
+def _chains(records: Sequence[PairRecord], truth: TrueTrajectory | None) -> dict[str, list[Array]]:
+    """Orientations of the keyframes by source: the estimate, the gyro, and the truth if known.
+
+    A pair without a rotation is bridged by the gyro.
+    """
+    unknown = np.full((3, 3), np.nan)
+    gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
+    pairs = zip(records, gyro, strict=True)
+    estimated = [g if np.isnan(r.pose.R).any() else r.pose.R for r, g in pairs]
+    chains = {'estimated': _accumulated(estimated), 'gyro alone': _accumulated(gyro)}
+    if truth is not None:
+        poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
+        rotations = [unknown if pose is None else pose[0] for pose in poses]
+        chains['ground truth'] = _accumulated(rotations)
+    return chains
+
+
+def _vectors(chain: Sequence[Array]) -> Array:
+    """Rotation vectors (N, 3) [deg]; NaN where a rotation is not known."""
+    unknown = np.full(3, np.nan)
+    return np.degrees(
+        [Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else unknown for R in chain]
+    )
 
 
 def _over_time(count: int, title: str) -> Figure:
