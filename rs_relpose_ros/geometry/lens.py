@@ -61,6 +61,19 @@ _PROFILE = 9
 _GAIN = 3
 
 
+@small_kernel
+def _series(k: Array, first: int, count: int, s: float) -> tuple[float, float, float]:
+    """``k_first s + k_first+1 s^2 + ...`` of `count` coefficients, and two derivatives by s."""
+    value = 0.0
+    slope = 0.0
+    half_bend = 0.0
+    for m in range(count - 1, -2, -1):  # Horner's scheme of all three; no constant
+        half_bend = half_bend * s + slope
+        slope = slope * s + value
+        value = value * s + (k[first + m] if m >= 0 else 0.0)
+    return value, slope, 2.0 * half_bend
+
+
 @kernel
 def fisheye_profile(s: float, k: Array, out: Array) -> None:
     """OpenCV's fisheye model: the angle off the axis becomes the radius.
@@ -77,21 +90,20 @@ def fisheye_profile(s: float, k: Array, out: Array) -> None:
     theta = math.atan(r)
     t2 = theta * theta
     wider = 1.0 + s  # d r / d theta
-    angle = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-    by_theta = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
-    # The second derivative of a by theta, over theta.
-    bend = 6.0 * k[0] + t2 * (20.0 * k[1] + t2 * (42.0 * k[2] + t2 * 72.0 * k[3]))
+    series, slope, bend = _series(k, 0, 4, t2)
+    angle = theta * (1.0 + series)
+    by_theta = 1.0 + series + 2.0 * t2 * slope
+    by_theta_2 = theta * (6.0 * slope + 4.0 * t2 * bend)
     out[0] = angle / r
     out[1] = (by_theta / wider - out[0]) / s
-    by_theta_slope = (bend * theta / r - 2.0 * by_theta) / (wider * wider)
+    by_theta_slope = (by_theta_2 / r - 2.0 * by_theta) / (wider * wider)
     out[2] = (by_theta_slope - 3.0 * out[1]) / s
-    power = theta * t2  # theta^(2 m + 1) of coefficient m
+    power = 1.0  # theta^(2 m + 2) of coefficient m
     for m in range(_N_RADIAL):
-        gain = power / r
-        by_theta = (2 * m + 3) * power / theta
-        out[_GAIN + 2 * m] = gain
-        out[_GAIN + 1 + 2 * m] = (by_theta / wider - gain) / s
         power *= t2
+        gain = power * theta / r
+        out[_GAIN + 2 * m] = gain
+        out[_GAIN + 1 + 2 * m] = ((2 * m + 3) * power / wider - gain) / s
 
 
 def ideal_fisheye(points: Array) -> Array:
@@ -106,25 +118,22 @@ def rational_profile(s: float, k: Array, out: Array) -> None:
 
     ``R(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)``; `k` (6,).
     """
-    above = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
-    below = 1.0 + s * (k[3] + s * (k[4] + s * k[5]))
-    above_slope = k[0] + s * (2.0 * k[1] + s * 3.0 * k[2])
-    below_slope = k[3] + s * (2.0 * k[4] + s * 3.0 * k[5])
-    radial = above / below
+    above, above_slope, above_bend = _series(k, 0, 3, s)
+    below, below_slope, below_bend = _series(k, 3, 3, s)
+    below += 1.0
+    radial = (1.0 + above) / below
     slope = (above_slope - radial * below_slope) / below
-    above_bend = 2.0 * k[1] + 6.0 * k[2] * s
-    below_bend = 2.0 * k[4] + 6.0 * k[5] * s
     bend = (above_bend - 2.0 * slope * below_slope - radial * below_bend) / below
     out[0] = radial
     out[1] = 2.0 * slope
     out[2] = 4.0 * bend
-    power = 1.0  # s^m of coefficient m - 1
+    power = 1.0  # s^m of coefficient m
     for m in range(_N_RADIAL):
-        before = power
+        gain_slope = (m + 1) * power
         power *= s
         gain = power / below
         out[_GAIN + 2 * m] = gain
-        out[_GAIN + 1 + 2 * m] = 2.0 * ((m + 1) * before - gain * below_slope) / below
+        out[_GAIN + 1 + 2 * m] = 2.0 * (gain_slope - gain * below_slope) / below
 
 
 # In compiled code: profile_at(address, s, k, out).
