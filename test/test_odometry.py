@@ -22,7 +22,9 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry import need_gtsam
+from rs_relpose_ros.odometry.doubts import Doubts
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
 from rs_relpose_ros.odometry.offline import (
@@ -34,10 +36,17 @@ from rs_relpose_ros.odometry.offline import (
     write_states,
     write_tum,
 )
-from rs_relpose_ros.odometry.pair import deviations, KeyframePair
+from rs_relpose_ros.odometry.pair import (
+    Body,
+    deviations,
+    later,
+    Measured,
+    Mount,
+    without_far_velocities,
+)
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Notice, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
+from rs_relpose_ros.pipeline.findings import Assessment, Code, Evidence, Finding, FindingState, Why
 
 START_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -61,7 +70,7 @@ PARAMETERS = Parameters.from_mapping(
 
 @dataclass(frozen=True)
 class Walk:
-    pairs: list[KeyframePair]
+    pairs: list[PublishedPair]
     samples: list[ImuSample]
     stamps: np.ndarray  # [ns] of the truth, with positions and quaternions
     positions: np.ndarray
@@ -121,17 +130,20 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
             )
         stamp1, stamp2 = (START_NS + round(times[i] * 1e9) for i in (k, k + 1))
         pairs.append(
-            KeyframePair(
-                stamp2,
-                stamp1,
-                stamp2,
-                'camera',
-                status,
-                images,
-                baseline * math.exp(0.2 * rng.standard_normal()),
-                0.2,
-                np.array(GYRO_BIAS),
-                '',
+            PublishedPair(
+                reference_stamp_ns=stamp1,
+                stamp_ns=stamp2,
+                frame_id='camera',
+                reference_imu_ns=stamp1,
+                current_imu_ns=stamp2,
+                status=status,
+                reason='',
+                baseline=baseline * math.exp(0.2 * rng.standard_normal()),
+                baseline_log_sigma=0.2,
+                gyro_bias=np.array(GYRO_BIAS),
+                images=images,
+                health='unknown',
+                findings=Assessment(()),
             )
         )
     return Walk(
@@ -150,7 +162,7 @@ def run(given: Walk, *, pairs=None, samples=None, estimator=None):
     waiting = list(given.samples if samples is None else samples)
     out = []
     for pair in given.pairs if pairs is None else pairs:
-        while waiting and waiting[0].stamp_ns <= pair.current_ns + SECOND // 50:
+        while waiting and waiting[0].stamp_ns <= pair.current_imu_ns + SECOND // 50:
             estimator.add_imu(waiting.pop(0))
             out += estimator.take()
         estimator.add_pair(pair)
@@ -176,7 +188,7 @@ def without(pairs, begin, end):
     return [
         pair
         for pair in pairs
-        if seconds_of(pair.current_ns) < begin or seconds_of(pair.reference_ns) > end
+        if seconds_of(pair.current_imu_ns) < begin or seconds_of(pair.reference_imu_ns) > end
     ]
 
 
@@ -200,51 +212,60 @@ def test_derivatives_of_deviations_are_those_of_finite_differences():
     rng = np.random.default_rng(0)
     C = Rotation.random(random_state=1).as_matrix()
     arm = np.array([0.1, -0.05, 0.03])
-    # R to the world, position, velocity, rate.
     bodies = [
-        (
+        Body(
             Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix(),
             np.array([0.3 * k, 0.0, 0.1]),
+            rng.normal(size=3),
             rng.normal(size=3),
             rng.normal(size=3),
         )
         for k in range(2)
     ]
-    (R1, c1), (R2, c2) = ((R @ C.T, p + R @ arm) for R, p, _, _ in bodies)
-    R, q = np.ascontiguousarray(R1.T @ R2), R1.T @ (c2 - c1)
-    t, velocities = q / np.linalg.norm(q), rng.normal(size=6)
-    exact, _ = deviations(*bodies[0], *bodies[1], C, arm, R, t, velocities)
-    np.testing.assert_allclose(exact[:5], 0.0, atol=1e-12)
-    for (body_R, _, v, w), row in zip(bodies, (5, 8), strict=True):
-        moving = v + body_R @ np.cross(w, arm)
-        np.testing.assert_allclose(
-            exact[row : row + 3],
-            R1.T @ moving / np.linalg.norm(q) - velocities[row - 5 : row - 2],
-            atol=1e-12,
-        )
+    for axes, delay in ((np.zeros(3), 0.0), (np.array([0.02, -0.03, 0.01]), 0.006)):
+        mount = Mount(C, arm, axes, delay)
+        # The bodies and the camera when the rows are read, without the kernel.
+        C_true = Rotation.from_rotvec(axes).as_matrix() @ C
+        R_read = [b.R @ Rotation.from_rotvec(delay * b.rate).as_matrix() for b in bodies]
+        at = [b.position + delay * b.velocity for b in bodies]
+        moving = [
+            b.velocity + delay * b.acceleration + R_b @ np.cross(b.rate, arm)
+            for b, R_b in zip(bodies, R_read, strict=True)
+        ]
+        R1, R2 = (R_b @ C_true.T for R_b in R_read)
+        q = R1.T @ (at[1] + R_read[1] @ arm - at[0] - R_read[0] @ arm)
+        R, t = np.ascontiguousarray(R1.T @ R2), q / np.linalg.norm(q)
+        velocities = rng.normal(size=6)
+        exact, _ = deviations(*bodies, mount, Measured(R, t, velocities))
+        expected = np.concatenate([R1.T @ v for v in moving]) / np.linalg.norm(q) - velocities
+        np.testing.assert_allclose(exact, [*np.zeros(5), *expected], atol=1e-12)
 
-    t = t + 0.05 * rng.normal(size=3)
-    t /= np.linalg.norm(t)
+        t = t + 0.05 * rng.normal(size=3)
+        measured = Measured(R, t / np.linalg.norm(t), velocities)
+        _, by = deviations(*bodies, mount, measured)
+        for k, step in enumerate(1e-6 * np.eye(25)):
+            plus, minus = (
+                deviations(
+                    moved(bodies[0], x[:9]), moved(bodies[1], x[9:18]), turned(mount, x), measured
+                )[0]
+                for x in (step, -step)
+            )
+            np.testing.assert_allclose(by[:, k], (plus - minus) / 2e-6, atol=1e-6)
 
-    def moved(body, x):
-        R, p, v, w = body
-        return R @ Rotation.from_rotvec(x[:3]).as_matrix(), p + R @ x[3:6], v + x[6:9], w
 
-    _, by = deviations(*bodies[0], *bodies[1], C, arm, R, t, velocities)
-    for k, step in enumerate(1e-6 * np.eye(21)):
-        plus, minus = (
-            deviations(
-                *moved(bodies[0], x[:9]),
-                *moved(bodies[1], x[9:18]),
-                C,
-                arm + x[18:],
-                R,
-                t,
-                velocities,
-            )[0]
-            for x in (step, -step)
-        )
-        np.testing.assert_allclose(by[:, k], (plus - minus) / 2e-6, atol=1e-6)
+def moved(body, x):
+    """A body after small changes (9,) of rotation, position and velocity."""
+    return body._replace(
+        R=body.R @ Rotation.from_rotvec(x[:3]).as_matrix(),
+        position=body.position + body.R @ x[3:6],
+        velocity=body.velocity + x[6:9],
+    )
+
+
+def turned(mount, x):
+    """The mount after small changes of the arm, of the axes on the left, and of the delay."""
+    more = Rotation.from_rotvec(x[21:24]) * Rotation.from_rotvec(mount.axes)
+    return Mount(mount.R, mount.arm + x[18:21], more.as_rotvec(), mount.delay + x[24])
 
 
 # --- paths
@@ -308,7 +329,7 @@ def test_nothing_is_published_before_the_scale_is_known():
     estimator, out = run(given, pairs=pairs)
     assert out == []
     assert estimator.state is OdometryState.STARTING
-    assert estimator.propagated(pairs[-1].current_ns) is None
+    assert estimator.propagated(pairs[-1].current_imu_ns) is None
 
 
 def test_slow_motion_is_no_known_scale():
@@ -319,18 +340,18 @@ def test_slow_motion_is_no_known_scale():
         state = KeyframeState(
             np.eye(3), zero, np.array([0.0, 0.0, speed]), zero, zero, zero, variances
         )
-        graph = KeyframeGraph(state, np.eye(3), PARAMETERS.imu, PARAMETERS.odometry)
+        graph = KeyframeGraph(state, Doubts(PARAMETERS), PARAMETERS)
         assert graph.scale_sigma() == pytest.approx(expected, rel=1e-6)
 
 
 def test_far_velocities_have_no_information(walked):
     """Linearised at 25 baselines per interval beside the mean velocity; one baseline is near."""
     pair = walked.pairs[5]
-    assert pair.without_far_velocities() is pair
+    assert without_far_velocities(pair) is pair
     for way, rows in ((1.0, 11), (25.0, 5)):
         moved = pair.images.velocities + np.eye(6)[4] * way / INTERVAL
         far = replace(pair, images=replace(pair.images, velocities=moved))
-        assert len(far.without_far_velocities().images.gradient) == rows
+        assert len(without_far_velocities(far).images.gradient) == rows
 
 
 def test_a_gross_pair_before_the_start_is_a_wrong_start(walked):
@@ -340,7 +361,7 @@ def test_a_gross_pair_before_the_start_is_a_wrong_start(walked):
         for k, pair in enumerate(walked.pairs[:20])
     ]
     _, out = run(walked, pairs=pairs)
-    assert seconds_of(out[0].imu_ns) > seconds_of(pairs[2].current_ns) + 3.0 * INTERVAL
+    assert seconds_of(out[0].imu_ns) > seconds_of(pairs[2].current_imu_ns) + 3.0 * INTERVAL
     assert ate(out, walked.truth) < 0.05
 
 
@@ -386,7 +407,7 @@ def test_order_of_messages_does_not_matter(walked, tracked):
             for k, sample in enumerate(walked.samples)
         ]
         + [
-            (pair.current_ns + rng.uniform(0.0, 0.08) * SECOND, 1, k, pair)
+            (pair.current_imu_ns + rng.uniform(0.0, 0.08) * SECOND, 1, k, pair)
             for k, pair in enumerate(walked.pairs)
         ]
     )
@@ -400,7 +421,7 @@ def test_order_of_messages_does_not_matter(walked, tracked):
 
 def test_the_imu_propagates_keyframes(walked):
     half = len(walked.pairs) // 2
-    end = seconds_of(walked.pairs[half - 1].current_ns) + 1.5
+    end = seconds_of(walked.pairs[half - 1].current_imu_ns) + 1.5
     estimator, out = run(
         walked,
         pairs=walked.pairs[:half],
@@ -498,7 +519,7 @@ def test_covariances_of_the_base_are_those_of_samples(of_base):
                 position=state.position + state.R @ d[3:6],
                 velocity=state.velocity + d[6:9],
                 gyro_bias=state.gyro_bias + d[12:15],
-                arm=state.arm + d[15:],
+                doubts=state.doubts + d[15:],
             )
         )
         turn = Rotation.from_matrix(one.R @ published.R.T).as_rotvec()
@@ -575,10 +596,10 @@ def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
     pairs = [
         pair
-        if seconds_of(pair.current_ns) < 6.0
+        if seconds_of(pair.current_imu_ns) < 6.0
         else replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
         for pair in walked.pairs
-        if seconds_of(pair.current_ns) < 10.0
+        if seconds_of(pair.current_imu_ns) < 10.0
     ]
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['contradicting'] > 5
@@ -596,7 +617,7 @@ def test_pairs_that_are_wrong_together_count_by_their_innovations():
         given,
         pairs=[
             replace(pair, images=replace(pair.images, t=turn @ pair.images.t))
-            if 4.0 < seconds_of(pair.current_ns) < 6.5
+            if 4.0 < seconds_of(pair.current_imu_ns) < 6.5
             else pair
             for pair in given.pairs
         ],
@@ -615,7 +636,7 @@ def test_the_end_of_a_path_at_a_keyframe_is_no_gap_of_the_imu(walked):
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
     pairs = [
         replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
-        if 6.0 < seconds_of(pair.current_ns) < 8.2
+        if 6.0 < seconds_of(pair.current_imu_ns) < 8.2
         else pair
         for pair in walked.pairs
     ]
@@ -630,7 +651,7 @@ def test_the_end_of_a_path_at_a_keyframe_is_no_gap_of_the_imu(walked):
 def test_pairs_without_information_are_no_keyframes(walked, tracked):
     pairs = []
     for pair in walked.pairs:
-        if not 4.0 < seconds_of(pair.current_ns) < 6.5:
+        if not 4.0 < seconds_of(pair.current_imu_ns) < 6.5:
             pairs.append(pair)
             continue
         # One for each frame, as where nothing can be matched.
@@ -639,8 +660,8 @@ def test_pairs_without_information_are_no_keyframes(walked, tracked):
                 pair,
                 status='TOO_FEW_MATCHES',
                 images=None,
-                reference_ns=pair.reference_ns + k * SECOND // 30,
-                current_ns=pair.reference_ns + (k + 1) * SECOND // 30,
+                reference_imu_ns=pair.reference_imu_ns + k * SECOND // 30,
+                current_imu_ns=pair.reference_imu_ns + (k + 1) * SECOND // 30,
             )
             for k in range(4)
         ]
@@ -697,7 +718,7 @@ def test_the_published_path_is_continuous_and_increasing(walked, delay):
     continuous, published, waiting = ContinuousPath(estimator.propagated), [], list(walked.pairs)
     for k, sample in enumerate(samples_of(walked, -1.0, 8.0)):
         estimator.add_imu(sample)
-        while waiting and waiting[0].later(SECOND // 50).current_ns + delay < sample.stamp_ns:
+        while waiting and later(waiting[0], SECOND // 50).current_imu_ns + delay < sample.stamp_ns:
             estimator.add_pair(waiting.pop(0))
             estimator.take(most=1)
         if k % 6 == 0:
@@ -769,7 +790,7 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
 
 @pytest.mark.parametrize('seconds', [-100.0, -0.5, 0.5])
 def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
-    jump, at = round(seconds * SECOND), seconds_of(walked.pairs[39].current_ns)
+    jump, at = round(seconds * SECOND), seconds_of(walked.pairs[39].current_imu_ns)
     estimator, first = run(
         walked,
         pairs=walked.pairs[:40],
@@ -780,8 +801,8 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
         replace(
             pair,
             stamp_ns=pair.stamp_ns + jump,
-            reference_ns=pair.reference_ns + jump,
-            current_ns=pair.current_ns + jump,
+            reference_imu_ns=pair.reference_imu_ns + jump,
+            current_imu_ns=pair.current_imu_ns + jump,
         )
         for pair in walked.pairs[40:]
     ]
@@ -835,7 +856,7 @@ def test_a_path_is_lost_where_the_camera_has_another_clock(walked, apart):
         estimator=OdometryEstimator(PARAMETERS),
         samples=samples_of(walked, -1.0, 3.1),
     )
-    pairs = [pair.later(apart * SECOND) for pair in walked.pairs[20:34]]
+    pairs = [later(pair, apart * SECOND) for pair in walked.pairs[20:34]]
     if apart == 5:  # they may still be right
         estimator.add_pair(pairs.pop())
     for pair in pairs if abs(apart) > 10 else ():
@@ -862,7 +883,9 @@ def test_an_imu_of_another_frame_gives_no_path_and_the_reason(walked, turn):
             walked,
             samples=samples,
             estimator=OdometryEstimator(PARAMETERS),
-            pairs=[pair for pair in walked.pairs[:38] if seconds_of(pair.reference_ns) > begin],
+            pairs=[
+                pair for pair in walked.pairs[:38] if seconds_of(pair.reference_imu_ns) > begin
+            ],
         )
         assert [k for k in out if not 3.0 < seconds_of(k.imu_ns) < 5.5] == []
         assert not (out and begin == 0.0)
@@ -889,8 +912,8 @@ def test_pairs_that_are_wrong_together_do_not_disprove_axes(walked):
         estimator, out = run(
             walked,
             pairs=[
-                replace(pair, contradiction=finding)
-                if 0.0 < seconds_of(pair.current_ns) - begin < 1.0
+                replace(pair, findings=Assessment((finding,)))
+                if 0.0 < seconds_of(pair.current_imu_ns) - begin < 1.0
                 else pair
                 for pair in walked.pairs
             ],
@@ -900,7 +923,7 @@ def test_pairs_that_are_wrong_together_do_not_disprove_axes(walked):
 
 
 def test_loss_is_reported_without_further_pairs(walked):
-    last = seconds_of(walked.pairs[19].current_ns)
+    last = seconds_of(walked.pairs[19].current_imu_ns)
     for age, state in (
         (0.2, OdometryState.TRACKING),
         (0.31, OdometryState.UNCERTAIN),
@@ -929,7 +952,7 @@ def test_loss_is_reported_without_further_pairs(walked):
 )
 def test_frames_show_whether_a_pair_is_missing(walked, frames_end, state):
     """Frames at 30 Hz until `frames_end` after a pair: slow motion, or a camera that stops."""
-    last = seconds_of(walked.pairs[19].current_ns)
+    last = seconds_of(walked.pairs[19].current_imu_ns)
     estimator, _ = run(
         walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, last + 0.1)
     )
@@ -974,7 +997,7 @@ def test_earlier_losses_stay_in_the_covariance(walked):
 def test_pairs_without_imu_do_not_accumulate(walked):
     estimator = OdometryEstimator(PARAMETERS)
     for k in range(300):
-        estimator.add_pair(replace(walked.pairs[0], current_ns=START_NS + k * SECOND))
+        estimator.add_pair(replace(walked.pairs[0], current_imu_ns=START_NS + k * SECOND))
         estimator.take()
     assert estimator.counts['dropped'] == 290
 
@@ -983,7 +1006,7 @@ def test_memory_is_constant_unless_the_path_is_kept(walked):
     estimator, sizes, begin = OdometryEstimator(PARAMETERS), [], -1.0
     for k in range(0, 60, 20):
         pairs = walked.pairs[k : k + 20]
-        end = seconds_of(pairs[-1].current_ns) + 0.1
+        end = seconds_of(pairs[-1].current_imu_ns) + 0.1
         run(walked, estimator=estimator, pairs=pairs, samples=samples_of(walked, begin, end))
         begin = end
         sizes.append(objects_behind(estimator))
@@ -1063,7 +1086,7 @@ def test_states_are_written_as_they_are(walked, tmp_path):
     """A camera that is not the base: its pose, velocity and covariance by samples of the base."""
     estimator = OdometryEstimator(OF_BASE)
     states = PublishedStates(estimator, 30.0)
-    pairs = [(pair.current_ns + SECOND // 50, pair) for pair in walked.pairs[:20]]
+    pairs = [(pair.current_imu_ns + SECOND // 50, pair) for pair in walked.pairs[:20]]
     samples = [(sample.stamp_ns, sample) for sample in samples_of(walked, -1.0, 3.2)]
     follow(estimator, pairs, samples, states.after)
     assert len(states.published) > 50
@@ -1127,3 +1150,55 @@ def test_consistency_is_that_of_the_covariances(walked, tracked):
     assert found['beyond'] == {'position': 0.5, 'rotation': 0.5, 'velocity': 0.5}
     late = replace(origin, imu_ns=origin.imu_ns + 100 * SECOND)
     assert consistency([late], first, walked.truth) == {'nees': None, 'beyond': None}
+
+
+# --- deviations of the configuration
+
+OFFSET = 5_000_000  # [ns]
+TURN = np.array([0.008, -0.006, 0.007])  # [rad] of the camera's axes
+
+
+def wrong_by_one_sigma(given, name, sigma):
+    """Pairs and parameters whose offset or axes are off, with a sigma."""
+    if name == 'time_offset':
+        late = [
+            replace(
+                pair,
+                reference_imu_ns=pair.reference_imu_ns - OFFSET,
+                current_imu_ns=pair.current_imu_ns - OFFSET,
+            )
+            for pair in given.pairs
+        ]
+        return late, PARAMETERS.updated({'time_offset_sigma': sigma})
+    quat = (Rotation.from_rotvec(-TURN) * Rotation.from_quat(QUAT)).as_quat()
+    changed = {'quat_cam_imu_xyzw': tuple(quat.tolist()), 'axes_sigma': sigma}
+    return given.pairs, PARAMETERS.updated(changed)
+
+
+@pytest.mark.parametrize(
+    'name, sigma, true', [('time_offset', 5e-3, [5e-3]), ('axes', 7e-3, TURN.tolist())]
+)
+def test_states_hold_where_the_configuration_is_off_by_its_sigma(walked, name, sigma, true):
+    """Offset or axes are unknowns of the graph; without a sigma pairs contradict the IMU."""
+    errors, contradicting = [], []
+    for known in (0.0, sigma):
+        pairs, parameters = wrong_by_one_sigma(walked, name, known)
+        estimator, out = run(
+            walked, pairs=pairs, estimator=OdometryEstimator(parameters, keep=True)
+        )
+        errors.append(path_of(out, walked.truth).errors)
+        contradicting.append(estimator.counts['contradicting'])
+    assert contradicting[0] > 5 and contradicting[1] == estimator.counts['lost'] == 0
+    assert errors[1].ate_m < 0.5 * errors[0].ate_m
+    assert abs(errors[1].scale_error) < 0.01
+    values, sigmas = map(np.array, estimator.deviations[name])
+    assert (sigmas < 0.7 * sigma).all()
+    assert (np.abs(values - true) < 3.0 * sigmas).all()
+    # The ground truth is that of the camera's true axes, at times of the IMU.
+    found = consistency(out, estimator.smoothed()[0], walked.truth)
+    assert max(found['beyond'].values()) == 0.0
+    assert max(found['nees'].values()) < 1.0
+
+
+def test_without_sigmas_nothing_but_the_lever_arm_is_unknown(tracked):
+    assert tracked[0].deviations == {}

@@ -53,10 +53,11 @@ from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.nodes.odometry_node import OdometryNode
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import aligned
-from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.pair import contradiction
 from rs_relpose_ros.odometry.states import Base
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -100,12 +101,12 @@ def imu_message(sample: ImuSample) -> Imu:
     )
 
 
-def pairs_message(pair: KeyframePair, health: Assessment) -> Any:
+def pairs_message(pair: PublishedPair, health: Assessment) -> Any:
     """Message on ``~/pairs``, as of relpose_node."""
     return build.pair_messages(pair_result(pair, health), build.rclpy_types)['pairs']
 
 
-def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
+def pair_result(pair: PublishedPair, health: Assessment) -> PairResult:
     pose = RelativePose(Status(pair.status))
     if pair.images is not None:
         zero, eye = np.zeros(3), np.eye(6)
@@ -125,10 +126,10 @@ def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
         )
     none = np.zeros((0, 3))
     return PairResult(
-        pair.reference_ns,
+        pair.reference_imu_ns,
         pair.stamp_ns,
-        pair.reference_ns,
-        pair.current_ns,
+        pair.reference_imu_ns,
+        pair.current_imu_ns,
         pair.frame_id,
         0.15,
         pose,
@@ -165,8 +166,8 @@ def test_a_contradicted_accelerometer_stops_the_path(code, state, why, stops):
     health = Assessment((unknown, finding))
     pair = walk('walk:2', 1.0).pairs[0]
     expected = finding if stops else None
-    assert KeyframePair.of_result(pair_result(pair, health)).contradiction == expected
-    assert KeyframePair.of_message(pairs_message(pair, health)).contradiction == expected
+    assert contradiction(PublishedPair.of_result(pair_result(pair, health))) == expected
+    assert contradiction(PublishedPair.of_status(pairs_message(pair, health))) == expected
 
 
 def test_a_path_ends_with_the_whole_text_of_a_finding():
@@ -176,12 +177,12 @@ def test_a_path_ends_with_the_whole_text_of_a_finding():
     for sample in given.samples:
         estimator.add_imu(sample)
     for pair in given.pairs[:-1]:
-        estimator.add_pair(KeyframePair.of_message(pairs_message(pair, Assessment(()))))
+        estimator.add_pair(PublishedPair.of_status(pairs_message(pair, Assessment(()))))
     estimator.take(end=True)
     estimator.warnings()
     wrong = pairs_message(given.pairs[-1], Assessment((build.WRONG_AXES,)))
     received = deserialize_message(serialize_message(wrong), DiagnosticArray)
-    estimator.add_pair(KeyframePair.of_message(received))
+    estimator.add_pair(PublishedPair.of_status(received))
     estimator.take(end=True)
     assert estimator.warnings()[-1].text == f'lost: axes wrong: {build.WRONG_AXES_TEXT}'
 
@@ -196,6 +197,8 @@ BAD_PAIRS = {
     'no rotation': ('image_rotation_xyzw', '0 0 0 0', 'image_information of ~/pairs'),
     'infinite baseline': ('baseline_m', 'inf', 'baseline_m of ~/pairs must be finite'),
     'backwards in time': ('current_imu_ns', str(START_NS - SECOND), 'must be later than'),
+    'no float32': ('image_by_deviation', 'AAAA', 'finite float32 in base64'),
+    'other unknowns': ('image_by_deviation', 'AAAAAA==', '11 x 9 numbers, got 1'),
     'no findings': ('findings', '', 'findings of a message'),
     'another cause': ('findings', '[{"code": "the moon"}]', 'findings of a message'),
     'nested findings': ('findings', '[' * 90_000, 'findings of a message'),
@@ -208,11 +211,11 @@ BAD_PAIRS = {
 def test_an_impossible_pair_is_refused_with_the_reason(case):
     key, text, said = BAD_PAIRS[case]
     message = pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(()))
-    KeyframePair.of_message(message)
+    PublishedPair.of_status(message)
     [value] = [item for item in message.status[0].values if item.key == key]
     value.value = text
     with pytest.raises(InputError, match=re.escape(said)):
-        KeyframePair.of_message(message)
+        PublishedPair.of_status(message)
 
 
 def stream(given: Walk) -> Iterator[tuple[float, Any]]:
@@ -220,7 +223,9 @@ def stream(given: Walk) -> Iterator[tuple[float, Any]]:
     for sample in given.samples:
         yield (sample.stamp_ns - START_NS) / SECOND + IMU_DELAY, imu_message(sample)
     for pair in given.pairs:
-        begin, end = ((ns - START_NS) / SECOND for ns in (pair.reference_ns, pair.current_ns))
+        begin, end = (
+            (ns - START_NS) / SECOND for ns in (pair.reference_imu_ns, pair.current_imu_ns)
+        )
         if any(begin < time <= end for time in CAMERA_STOPS) or within(end, CAMERA_STOPS):
             continue
         wrong = within(end, WRONG)
@@ -547,7 +552,7 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
             estimator.add_imu(PARTS[Role.IMU].read(message.message))
     keyframes = {}
     for message in sorted(pairs, key=lambda message: stamp_of(message)):
-        estimator.add_pair(KeyframePair.of_message(message))
+        estimator.add_pair(PublishedPair.of_status(message))
         keyframes |= {keyframe.stamp_ns: keyframe for keyframe in estimator.take()}
     of_keyframes = [message for message in received if stamp_of(message) in keyframes]
     assert len(of_keyframes) >= 10

@@ -43,8 +43,8 @@ def loop_of(given, one, two, rng, *, wrong=0.0):
         given.pairs[0],
         stamp_ns=two.imu_ns - ROW_NS,
         images=images,
-        reference_ns=one.imu_ns - ROW_NS,
-        current_ns=two.imu_ns - ROW_NS,
+        reference_imu_ns=one.imu_ns - ROW_NS,
+        current_imu_ns=two.imu_ns - ROW_NS,
     )
 
 
@@ -62,7 +62,7 @@ def test_loops_that_agree_with_the_path_correct_it():
     wrong = [loop_of(given, *ends[k], rng, wrong=1.2) for k in (1, 4)]
     # Within the covariance of the path, but not with the right ones.
     wrong_among = [loop_of(given, *ends[k], rng, wrong=0.3) for k in (1, 4)]
-    nowhere = replace(right[0], current_ns=right[0].current_ns + 7)  # at no keyframe
+    nowhere = replace(right[0], current_imu_ns=right[0].current_imu_ns + 7)  # at no keyframe
     empty = replace(right[0], images=None)
     assert estimator.close_loops([*wrong, nowhere, empty]) == []
     np.testing.assert_allclose(
@@ -72,7 +72,9 @@ def test_loops_that_agree_with_the_path_correct_it():
     )
     taken = estimator.close_loops([*wrong_among, *right, *wrong])
     after = estimator.smoothed()
-    assert [pair.current_ns - ROW_NS for pair in taken] == [pair.current_ns for pair in right]
+    assert [pair.current_imu_ns - ROW_NS for pair in taken] == [
+        pair.current_imu_ns for pair in right
+    ]
     assert end_error(after, given.truth) < 0.3 * end_error(before, given.truth)
     error = given.truth.relative_pose(after[0].imu_ns, after[-1].imu_ns)[1] - after[0].R.T @ (
         after[-1].position - after[0].position
@@ -218,7 +220,7 @@ def test_states_through_a_disturbance():
     velocity = np.gradient(given.positions, (given.stamps - START_NS) * 1e-9, axis=0)
     feed = disturbances.Feed(
         PARAMETERS.updated({'max_coast': 10.0}).to_mapping(),
-        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)],
+        [(pair.current_imu_ns, pair) for pair in without(given.pairs, 6.0, 8.0)],
         samples,
         [],
     )
@@ -260,9 +262,9 @@ def test_a_recording_in_parts(monkeypatch, tmp_path):
         return disturbances.Feed(
             PARAMETERS.to_mapping(),
             [
-                (pair.current_ns, pair)
+                (pair.current_imu_ns, pair)
                 for pair in given.pairs
-                if (first <= pair.reference_ns and pair.current_ns < last - is_first * 1e9)
+                if (first <= pair.reference_imu_ns and pair.current_imu_ns < last - is_first * 1e9)
             ],
             [(sample.stamp_ns, sample) for sample in part.samples],
             [],

@@ -29,8 +29,8 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
-from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import ContinuousPath, Odometry, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -172,7 +172,7 @@ class Feed(NamedTuple):
     """Input of the odometry, with arrivals [ns]: pairs, samples, stamps of frames."""
 
     values: Mapping[str, Any]  # of the parameters
-    pairs: list[tuple[int, KeyframePair]]
+    pairs: list[tuple[int, PublishedPair]]
     samples: list[tuple[int, ImuSample]]
     frames: list[tuple[int, int]]
 
@@ -181,7 +181,7 @@ def feed_of(recording: Recording) -> Feed:
     """Pairs of the front end on a recording, and its samples."""
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs = [
-        (arrives[pair.stamp_ns], KeyframePair.of_result(pair))
+        (arrives[pair.stamp_ns], PublishedPair.of_result(pair))
         for pair, _ in trust_runs.run(recording, recording.configured)
     ]
     delay_ns = to_nanoseconds(IMU_DELAY)
@@ -323,9 +323,9 @@ def on_feed(name: str, seed: int, feed: Feed, truth: TrueStates) -> DisturbedRun
     before = _sigmas(states, at, begin - 0.5)
     after = _sigmas(states, at, end + NORMAL_AGAIN)
     used = max(
-        _seconds(pair.current_ns)
+        _seconds(pair.current_imu_ns)
         for _, pair in feed.pairs
-        if pair.images is not None and _seconds(pair.current_ns) < begin
+        if pair.images is not None and _seconds(pair.current_imu_ns) < begin
     )
     uncertain = [
         _seconds(one.begin_ns) - used

@@ -23,10 +23,11 @@ from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.loops import close_loops
 from rs_relpose_ros.odometry.offline import follow, path_of
-from rs_relpose_ros.odometry.pair import deviations, KeyframePair, square_root
+from rs_relpose_ros.odometry.pair import Body, deviations, Measured, Mount, row_ns, square_root
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
@@ -93,8 +94,8 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs, views = [], {}
     for pair, _ in trust_runs.run(recording, recording.configured):
-        given = KeyframePair.of_result(pair)
-        views[given.current_ns + given.row_ns] = pair.stamp_ns, pair.parallax
+        given = PublishedPair.of_result(pair)
+        views[given.current_imu_ns + row_ns(given)] = pair.stamp_ns, pair.parallax
         pairs.append((arrives[pair.stamp_ns], given))
     estimator = OdometryEstimator(parameters, keep=True)
     delay_ns = to_nanoseconds(IMU_DELAY)
@@ -162,29 +163,24 @@ def _errors(path: Sequence[Odometry], truth: TrueTrajectory) -> tuple[float, flo
     )
 
 
-def _misfit(pair: KeyframePair, simulation: Simulation) -> float:
+def _misfit(pair: PublishedPair, simulation: Simulation) -> float:
     """Chi squared of a loop at the true poses, by its 3 sigma bound."""
-    states, images = simulation.states([pair.reference_ns, pair.current_ns]), pair.images
+    states = simulation.states([pair.reference_imu_ns, pair.current_imu_ns])
+    images = pair.images
     assert images is not None
-    bodies = [
-        (
+    first, second = (
+        Body(
             np.ascontiguousarray(states.R_world_cam[k]),
-            states.position[k],
-            states.velocity[k],
-            states.angular_velocity[k],
+            states.position[k].copy(),
+            states.velocity[k].copy(),
+            states.angular_velocity[k].copy(),
+            np.zeros(3),
         )
         for k in range(2)
-    ]
-    A, a = square_root(images.information, images.gradient)
-    deviation, _ = deviations(
-        *bodies[0],
-        *bodies[1],
-        np.eye(3),
-        np.zeros(3),
-        images.R,
-        np.nan_to_num(images.t, nan=1.0),
-        np.zeros(6),
     )
+    A, a = square_root(images.information, images.gradient)
+    mount = Mount(np.eye(3), np.zeros(3), np.zeros(3), 0.0)
+    deviation, _ = deviations(first, second, mount, Measured.of(pair))
     error = A @ deviation[: A.shape[1]] + a
     return float(error @ error) / float(chi2.isf(_BEYOND, len(error)))
 

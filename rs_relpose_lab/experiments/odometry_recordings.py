@@ -93,7 +93,7 @@ def _metrics(
     rows: RowTrajectory | None,
 ) -> RecordedPart:
     """`rows`: of the whole recording; None if it does not start: nothing to compare with."""
-    with_direction = [pair.reference_ns for _, pair in feed.pairs if pair.has_direction]
+    with_direction = [pair.reference_imu_ns for _, pair in feed.pairs if pair.has_direction]
     start = claimed = speed = scale = end = beyond = step = math.nan
     states = [state for state in states if rows is not None and rows.covers(state.imu_ns)]
     if rows is not None and len(states) > 3:

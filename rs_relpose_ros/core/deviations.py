@@ -60,12 +60,13 @@ ENTRIES = (
 )
 
 
-def _slices(sizes: dict[str, int]) -> dict[str, slice]:
+def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """The place of each name in a vector that has them one after the other."""
     first = first_indices(**sizes)
     return {name: slice(first[name], first[name] + size) for name, size in sizes.items()}
 
 
-_PARTS = _slices({entry.name: entry.size for entry in ENTRIES})
+_PARTS = slices({entry.name: entry.size for entry in ENTRIES})
 # Number of values of the whole vector.
 N_DEVIATIONS = sum(entry.size for entry in ENTRIES)
 # Places of the entries of `geometry.lens` in the whole vector.
@@ -98,7 +99,7 @@ class Selection:
         chosen = [entry for entry in ENTRIES if entry.name in {*names, *bases}]
         own = [bases.get(entry.name, np.eye(entry.size)) for entry in chosen]
         sizes = [basis.shape[1] for basis in own]
-        parts = _slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
+        parts = slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
         whole = np.zeros((N_DEVIATIONS, sum(sizes)))
         for (name, part), basis in zip(parts.items(), own, strict=True):
             whole[_PARTS[name], part] = basis

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.core import losses
+from rs_relpose_ros.core.deviations import FIRST, Selection
 from rs_relpose_ros.core.least_squares import adjusted_scores, cholesky, CR2, eliminate, inverse
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
@@ -216,6 +217,11 @@ def pair_state(
 
 # Deviations of a pose with velocities, without them, and of a rotation alone.
 POSE, DIRECTION, ROTATION = DW1, 5, 3
+# Deviations that move the estimate of the images alone. Their time offset is of the stamped row,
+# as the parameter; the deviations of the gyro are unknowns of whoever integrates it.
+IMAGES = Selection.of(
+    'axes', 'time_offset', 'readout_time', 'focal_log', 'principal_point', distortion=FIRST
+)
 # Share of the largest eigenvalue below which a direction counts as not observable.
 _RANK = 1e-12
 
@@ -236,6 +242,9 @@ class ImageInformation:
     velocities: Array  # (6,) d_1, d_2, in camera 1; NaN likewise
     information: Array  # (11, 11), (5, 5) or (3, 3) H
     gradient: Array  # (11,), (5,) or (3,) g
+    # (11, 9), (5, 9) or (3, 9): change of the estimate with the deviations of IMAGES,
+    # exact as float32; None if it is not known.
+    by_deviation: Array | None = None
 
     def of_rotation(self) -> ImageInformation:
         """The same of the rotation alone, the rest eliminated."""
@@ -257,7 +266,13 @@ class ImageInformation:
     def _reduced(self, kept: int) -> ImageInformation:
         """Keep the first deviations."""
         information, gradient = eliminate(self.information, self.gradient, kept)
-        return replace(self, information=information, gradient=gradient)
+        by_deviation = None if self.by_deviation is None else self.by_deviation[:kept]
+        return replace(self, information=information, gradient=gradient, by_deviation=by_deviation)
+
+    def moved_by(self, by_deviation: Array) -> ImageInformation:
+        """The same with the effect (11, 9) of deviations, as far as it has these unknowns."""
+        rows = by_deviation[: len(self.gradient)].astype(np.float32)
+        return replace(self, by_deviation=rows.astype(np.float64))
 
 
 def image_information(

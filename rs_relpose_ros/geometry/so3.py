@@ -8,6 +8,7 @@ it has the same bits as a sum that is written out.
 
 import math
 
+from numba.extending import register_jitable
 import numpy as np
 
 from rs_relpose_ros.geometry import Array
@@ -209,6 +210,7 @@ def multiply(A: Array, B: Array, out: Array) -> None:
         out[i, 0], out[i, 1], out[i, 2] = rotated_back(B, A[i])  # row of A B: B^T a_i
 
 
+@register_jitable
 def skew(v: Array) -> Array:
     """Cross-product matrix (3, 3) of a vector (3,): ``skew(a) @ b = a x b``."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -5,6 +5,7 @@ have the stamp of the current image.
 """
 
 from array import array
+import base64
 from collections.abc import Callable, Mapping, Sequence
 import math
 import sys
@@ -85,7 +86,8 @@ class PairValue(NamedTuple):
 
     key: str
     # Time: a timestamp [ns]; reals: any number of them. An unknown value is an empty text.
-    kind: Literal['text', 'time', 'real', 'vector', 'reals', 'findings']
+    # Packed: float32, little endian, in base64.
+    kind: Literal['text', 'time', 'real', 'vector', 'reals', 'packed', 'findings']
     of: Callable[[PairResult], Any]
     field: str = ''
 
@@ -95,6 +97,10 @@ class PairValue(NamedTuple):
             return number(value)
         if self.kind == 'findings':
             return findings_text.message_json(value)
+        if self.kind == 'packed':
+            return (
+                '' if value is None else base64.b64encode(value.astype('<f4').tobytes()).decode()
+            )
         if self.kind in ('vector', 'reals'):
             return '' if value is None else ' '.join(map(number, value))
         return str(value)
@@ -112,6 +118,8 @@ class PairValue(NamedTuple):
                     f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}'
                 )
             return int(text)
+        if self.kind == 'packed':
+            return self._unpacked(text)
         try:
             values = [float(word) for word in text[:2000].split()]  # the longest list has 66
         except ValueError:
@@ -126,15 +134,32 @@ class PairValue(NamedTuple):
                 raise InputError(f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
         return np.array(values)
 
+    def _unpacked(self, text: str) -> Array:
+        try:
+            data = base64.b64decode(text[:2000], validate=True)  # the longest array has 99
+            values = np.frombuffer(data, dtype='<f4').astype(np.float64)
+        except ValueError:
+            values = np.full(1, np.nan)
+        if not np.isfinite(values).all():
+            raise InputError(
+                f'{self.key} of ~/pairs must be finite float32 in base64, got {text[:60]!r}'
+            )
+        return values
 
-def _image_value(key: str, of: Callable[[ImageInformation], ArrayLike]) -> PairValue:
+
+def _image_value(
+    key: str,
+    of: Callable[[ImageInformation], ArrayLike | None],
+    kind: Literal['reals', 'packed'] = 'reals',
+) -> PairValue:
     """Part of the images' estimate; none if it is not known."""
 
     def part(pair: PairResult) -> Array | None:
-        numbers = np.nan if pair.pose.images is None else of(pair.pose.images)
-        return np.atleast_1d(numbers) if np.isfinite(numbers).all() else None
+        value = None if pair.pose.images is None else of(pair.pose.images)
+        numbers = np.atleast_1d(np.nan if value is None else value)
+        return numbers if np.isfinite(numbers).all() else None
 
-    return PairValue(key, 'reals', part)
+    return PairValue(key, kind, part)
 
 
 # `TOPICS_KEY` follows: the other topics of the pair.
@@ -169,6 +194,7 @@ PAIR_VALUES = {
         PairValue('reference_imu_ns', 'time', lambda pair: pair.reference_ns1, 'reference_imu_ns'),
         PairValue('current_imu_ns', 'time', lambda pair: pair.reference_ns2, 'current_imu_ns'),
         # `ImageInformation`: the estimate of the images without the priors of the IMU.
+        _image_value('image_by_deviation', lambda images: images.by_deviation, 'packed'),
         _image_value('image_row_s', lambda images: images.row_time),
         _image_value(
             'image_rotation_xyzw', lambda images: Rotation.from_matrix(images.R).as_quat()
@@ -183,7 +209,7 @@ PAIR_VALUES = {
         PairValue('gyro_bias_rad_s', 'vector', lambda pair: pair.gyro_bias, 'gyro_bias'),
         PairValue('health', 'text', lambda pair: pair.health.state.value, 'health'),
         PairValue('health_findings', 'text', lambda pair: findings_text.one_line(pair.health)),
-        PairValue('findings', 'findings', lambda pair: pair.health),
+        PairValue('findings', 'findings', lambda pair: pair.health, 'findings'),
     )
 }
 TOPICS_KEY = 'topics'

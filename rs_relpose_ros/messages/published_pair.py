@@ -4,8 +4,10 @@ For subscribers and readers of bags. Messages are read by field name only, and n
 trusted: an unusable one raises `InputError` with one line.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
@@ -16,13 +18,14 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.core.losses import robust_scale
 from rs_relpose_ros.core.triangulate import depths_of_rays
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.covariance import ImageInformation, POSE, ROTATION
+from rs_relpose_ros.estimator.covariance import ImageInformation, IMAGES, POSE, ROTATION
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
 from rs_relpose_ros.pipeline.findings import Assessment
+from rs_relpose_ros.pipeline.pair import PairResult
 
 # Largest deviation from 1 of the length of directions, quaternions and rays. Those of our node
 # have the rounding of float32; a larger bound would use a vector that is no direction.
@@ -38,6 +41,16 @@ _MOST_INFORMATION = 1e14
 # Largest speed [baselines/s, rad/s] of a message: above every camera, and its square is far from
 # an overflow. [chosen: 1e4 to 1e100 would do]
 _LARGEST_SPEED = 1e9
+# Interval that no pair reaches [ns]. [chosen: far above max_keyframe_interval]
+_LONGEST_NS = 100_000_000_000
+
+
+def _unknown_vector() -> Array:
+    return np.full(3, math.nan)
+
+
+def _unknown_covariance() -> Array:
+    return np.full((6, 6), math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +60,7 @@ class PublishedPair:
     Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
     ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
     are the inliers as of `outgoing.inlier_records`. Unknown values are NaN; there are no matches
-    without a pose.
+    without a pose. The fields from `has_pose` on are those of the other topics than ``~/pairs``.
     """
 
     reference_stamp_ns: int  # header stamp of the reference keyframe
@@ -57,19 +70,53 @@ class PublishedPair:
     current_imu_ns: int
     status: str  # as of `Status`
     reason: str  # of a pair without a pose; else empty
-    has_pose: bool
-    R: Array  # (3, 3)
-    t: Array  # (3,), of length 1: the scale of two views is not observable
-    covariance: Array  # (6, 6); without a pose the part of R is known
-    linear_velocity: Array  # (3,), of the current camera in its own frame [baselines per second]
-    angular_velocity: Array  # (3,), likewise [rad/s]
-    velocity_covariance: Array  # (6, 6), of the two
     baseline: float  # [m]
     baseline_log_sigma: float  # 1 sigma of its logarithm
     gyro_bias: Array  # (3,) [rad/s] that was removed, in the axes of the IMU
     images: ImageInformation | None  # estimate of the images alone
     health: str  # consistency of the calibration, as of `FindingState`
-    matches: NDArray[np.void]  # (N,), of MATCH_DTYPE
+    findings: Assessment  # the findings on the calibration
+    has_pose: bool = False
+    R: Array = field(default_factory=lambda: np.full((3, 3), math.nan))  # (3, 3)
+    # (3,) of length 1: the scale of two views is not observable.
+    t: Array = field(default_factory=_unknown_vector)
+    # (6, 6); without a pose the part of R is known.
+    covariance: Array = field(default_factory=_unknown_covariance)
+    # (3,) of the current camera in its own frame [baselines per second], [rad/s]; (6, 6) of both.
+    linear_velocity: Array = field(default_factory=_unknown_vector)
+    angular_velocity: Array = field(default_factory=_unknown_vector)
+    velocity_covariance: Array = field(default_factory=_unknown_covariance)
+    # (N,) of MATCH_DTYPE
+    matches: NDArray[np.void] = field(default_factory=lambda: np.empty(0, MATCH_DTYPE))
+
+    @classmethod
+    def of_status(cls, message: Any) -> PublishedPair:
+        """From a message on ``~/pairs`` alone; InputError if it is unusable."""
+        status = PairStatus(message)
+        fields = {value.field: status[key] for key, value in PAIR_VALUES.items() if value.field}
+        span_ns = fields['current_imu_ns'] - fields['reference_imu_ns']
+        if not 0 < span_ns < _LONGEST_NS:
+            raise InputError(
+                'current_imu_ns of ~/pairs must be later than reference_imu_ns, by '
+                'less than 100 s: the pair is not used'
+            )
+        fields['findings'] = status.findings()
+        return cls(
+            stamp_ns=stamp_ns(message.header),
+            frame_id=status.frame_id,
+            images=status.images(),
+            **fields,
+        )
+
+    @classmethod
+    def of_result(cls, pair: PairResult) -> PublishedPair:
+        """What ``~/pairs`` has of a pair of the front end, without a message."""
+        fields = {value.field: value.of(pair) for value in PAIR_VALUES.values() if value.field}
+        if fields['gyro_bias'] is None:
+            fields['gyro_bias'] = np.full(3, math.nan)
+        return cls(
+            stamp_ns=pair.stamp_ns, frame_id=pair.frame_id, images=pair.pose.images, **fields
+        )
 
     def __bool__(self) -> bool:
         """Whether there is a pose."""
@@ -79,6 +126,16 @@ class PublishedPair:
     def rotation_known(self) -> bool:
         """Whether `R` is known, as in every pose."""
         return bool(np.isfinite(self.R).all())
+
+    @property
+    def is_pure_rotation(self) -> bool:
+        """Whether the images have no translation."""
+        return self.status == Status.PURE_ROTATION.value
+
+    @property
+    def has_direction(self) -> bool:
+        """Whether the images alone determine the direction of motion."""
+        return self.images is not None and bool(np.isfinite(self.images.t).all())
 
 
 class PairStatus:
@@ -133,8 +190,21 @@ class PairStatus:
         H = np.zeros((size, size))
         H[rows] = H.T[rows] = upper
         _refuse_indefinite(H)
-        R = Rotation.from_quat(xyzw).as_matrix()
-        return ImageInformation(float(row_times[0]), R, t, velocities, H, gradient)
+        by_deviation = self['image_by_deviation']
+        if len(by_deviation) not in (0, size * IMAGES.size):
+            raise InputError(
+                f'image_by_deviation of ~/pairs must be {size} x {IMAGES.size} numbers, got '
+                f'{len(by_deviation)}'
+            )
+        return ImageInformation(
+            row_time=float(row_times[0]),
+            R=Rotation.from_quat(xyzw).as_matrix(),
+            t=t,
+            velocities=velocities,
+            information=H,
+            gradient=gradient,
+            by_deviation=by_deviation.reshape(size, -1) if len(by_deviation) else None,
+        )
 
     def topics(self) -> set[str]:
         """Topics of the pair, ``~/pairs`` included."""
@@ -184,26 +254,45 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
     stamps = {topic: stamp_ns(message.header) for topic, message in messages.items()}
     if len(set(stamps.values())) > 1:
         raise InputError(f'messages of one pair must have the same stamp, got {stamps}')
-    status = PairStatus(messages['pairs'])
-    topics = status.topics()
+    topics = PairStatus(messages['pairs']).topics()
     if stamps.keys() != topics:
         raise InputError(
             f'~/pairs lists {" ".join(sorted(topics))}, but there are {" ".join(sorted(stamps))}'
         )
-    fields = {value.field: status[key] for key, value in PAIR_VALUES.items() if value.field}
-    fields |= _without_rotation()
+    pair = PublishedPair.of_status(messages['pairs'])
     if 'relative_pose' in messages:
-        if time_ns(messages['reference'].time_ref) != fields['reference_stamp_ns']:
-            raise InputError('~/reference and ~/pairs must name the same reference keyframe')
-        fields |= _of_pose(messages)
-    elif 'relative_rotation' in messages:
-        fields |= _of_rotation(messages['relative_rotation'])
-    return PublishedPair(
-        stamp_ns=stamps['pairs'],
-        images=status.images(),
-        frame_id=status.frame_id,
-        has_pose='relative_pose' in messages,
-        **fields,
+        return _with_pose(pair, messages)
+    if 'relative_rotation' not in messages:
+        return pair
+    imu, topic = messages['relative_rotation'], '~/relative_rotation'
+    covariance, velocity_covariance = np.full((2, 6, 6), math.nan)
+    covariance[3:, 3:] = _covariance(topic, imu.orientation_covariance, 3)
+    velocity_covariance[3:, 3:] = _covariance(topic, imu.angular_velocity_covariance, 3)
+    return replace(
+        pair,
+        R=_rotation(topic, imu.orientation),
+        angular_velocity=_velocity(f'the angular velocity of {topic}', imu.angular_velocity),
+        covariance=covariance,
+        velocity_covariance=velocity_covariance,
+    )
+
+
+def _with_pose(pair: PublishedPair, messages: Mapping[str, Any]) -> PublishedPair:
+    """The pair with what the topics of a pose have."""
+    if time_ns(messages['reference'].time_ref) != pair.reference_stamp_ns:
+        raise InputError('~/reference and ~/pairs must name the same reference keyframe')
+    pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
+    linear, angular = twist.twist.linear, twist.twist.angular
+    return replace(
+        pair,
+        has_pose=True,
+        R=_rotation('~/relative_pose', pose.pose.orientation),
+        t=_unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
+        covariance=_covariance('~/relative_pose', pose.covariance, 6),
+        linear_velocity=_velocity('the linear velocity of ~/velocity', linear),
+        angular_velocity=_velocity('the angular velocity of ~/velocity', angular),
+        velocity_covariance=_covariance('~/velocity', twist.covariance, 6),
+        matches=match_records(messages['matches']),
     )
 
 

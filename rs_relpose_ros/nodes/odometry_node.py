@@ -15,6 +15,7 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import inputs
 from rs_relpose_ros.nodes.executor import PolledSubscription
@@ -22,7 +23,7 @@ from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.parameters import legal_qos
 from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
 from rs_relpose_ros.odometry import need_gtsam
-from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
+from rs_relpose_ros.odometry.pair import warm_up_odometry
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, OdometryState
 
 NAME = 'odometry_node'
@@ -190,7 +191,7 @@ class OdometryNode(StoppableNode):
     def _on_pair(self, message: Any) -> None:
         self._silent[self._pairs] = 0
         try:
-            pair = KeyframePair.of_message(message)
+            pair = PublishedPair.of_status(message)
         except InputError as error:
             self._warn(f'{error}; {self._pairs} must be of a relpose_node of this release')
             return
@@ -363,6 +364,9 @@ class OdometryNode(StoppableNode):
                 )
             ),
         ]
+        for name, (deviation, sigma) in estimator.deviations.items():
+            values.append((f'{name}_deviation', ' '.join(f'{value:.3g}' for value in deviation)))
+            values.append((f'{name}_deviation_sigma', ' '.join(f'{one:.3g}' for one in sigma)))
         if estimator.starts:
             started = estimator.starts[-1]
             values += [

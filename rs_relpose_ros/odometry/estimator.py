@@ -19,8 +19,12 @@ from rs_relpose_ros.geometry.so3 import exp_so3, heading, skew, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import StuckGyro
+from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.odometry.doubts import Doubts, UNKNOWN_ARM
 from rs_relpose_ros.odometry.graph import (
     ARM,
+    BIAS,
+    DOUBTS,
     GraphError,
     GYRO_BIAS,
     KeyframeGraph,
@@ -29,7 +33,13 @@ from rs_relpose_ros.odometry.graph import (
     POSE,
     VELOCITY,
 )
-from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.pair import (
+    as_loop,
+    contradiction,
+    later,
+    row_ns,
+    without_far_velocities,
+)
 from rs_relpose_ros.odometry.states import (
     Base,
     Notice,
@@ -41,63 +51,108 @@ from rs_relpose_ros.odometry.states import (
 from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.findings import Code
 
-# Largest delay of a message.
+# Largest delay of a message. With a smaller one samples of a busy driver are lost; a larger one
+# delays each keyframe where a sample is missing. [chosen: 0.05 to 0.2 s: drivers are late by less]
 _LATE_NS = 100_000_000
-# Consecutive samples later than that of a clock that was set back.
+# Consecutive samples later than that of a clock that was set back; fewer may be a driver that
+# sends a block late. [chosen: 3 to 20 would do: at 200 Hz five are 25 ms]
 _SET_BACK = 5
 # Number of waiting pairs beyond which all but the newest are left out: the IMU bridges them at the
-# cost of one, so that a slow machine keeps up.
+# cost of one, so that a slow machine keeps up. [chosen: 5 to 30 would do: 10 are a second or two]
 _MOST_WAITING = 10
-# Age of a usable pair [s] from which one is missing where no frame arrives, or where pairs have no
-# information; without knowledge of the frames, in intervals of recent pairs. Delay of a pair that
-# is due [s]; period of the test [ns].
-_OVERDUE, _OVERDUE_INTERVALS, _PAIR_DELAY, _WATCH_NS = 0.25, 1.5, 0.1, 50_000_000
-# Frame intervals without a frame after which the camera is silent.
+# Age of a usable pair from which one is missing [s], where no frame arrives or where pairs have no
+# information. A larger one reports a stopped camera late.
+# [measured: uncertain after 0.28 to 0.37 s, docs/lab/odometry.md, "Disturbances"]
+_OVERDUE = 0.25
+# The same in intervals of recent pairs, without knowledge of the frames: an interval may be half
+# longer than the one before. [chosen: 1.3 to 2 would do]
+_OVERDUE_INTERVALS = 1.5
+# Delay of a pair that is due [s]: its processing by relpose_node, and the way here. A shorter one
+# reports pairs of a busy machine as missing. [chosen: 0.05 to 0.2 s: two or three frames]
+_PAIR_DELAY = 0.1
+# Period in which overdue pairs are looked for [ns]: each costs a propagation.
+# [chosen: a fifth of `_OVERDUE`]
+_WATCH_NS = 50_000_000
+# Frame intervals without a frame after which the camera is silent. [chosen: 2 to 5: single frames
+# are dropped by any driver]
 _SILENT_FRAMES = 3
-# Time in which the deviations of pairs are averaged [ns].
+# Time in which the innovations of pairs are averaged [ns]. [chosen: 0.5 to 2 s: some pairs]
 _RECENT_NS = 1_000_000_000
-# Times within this belong to one keyframe: a tracked readout time moves the middle row.
+# Most pairs that are remembered for it. [chosen: more than a second has]
+_MOST_RECENT = 20
+# Times within this belong to one keyframe [ns]: a tracked readout time moves the middle row.
+# [chosen: 0.3 to 5 ms: between a correction and half a frame interval]
 _SAME_NS = 1_000_000
-# Samples that determine gravity at a start [s].
+# Samples that determine gravity at a start [s]. Longer ones average over the acceleration of a
+# hand, and the gyro integrates for longer. [chosen: 0.5 to 2 s: about a step of a walk]
 _GRAVITY_WINDOW = 1.0
-# 1 sigma of that direction for a moving body [rad].
+# 1 sigma of that direction for a moving body [rad]: 1 m/s^2 of mean acceleration.
+# [derived: hand-held accelerations are 0.3 to 3 m/s^2 rms, averaged over a second]
 _MOVING_TILT = 0.1
 # Least 1 sigma of the accelerometer's bias [m/s^2]: factory calibration leaves 0.2 to 0.4.
+# [measured: docs/lab/odometry.md, "Starts", bias]
 _ACCEL_BIAS = 0.3
-# 1 sigma of the velocity at a start at rest and in motion [m/s], per axis; of its free heading and
-# position [rad, m].
-_REST_VELOCITY, _ANY_VELOCITY, _GAUGE_SIGMA = 0.01, 3.0, 1e-4
-# Largest 1 sigma of the logarithm of a baseline that starts a graph, and the initial speed without
-# one [m/s]: pairs of a global shutter have no baseline.
-_START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
+# 1 sigma of the velocity at a start at rest [m/s], per axis. [chosen: 5 to 20 mm/s: images are at
+# rest within half a pixel]
+_REST_VELOCITY = 0.01
+# 1 sigma of the velocity at a start in motion [m/s], per axis: no information. [chosen: 2 to 10]
+_ANY_VELOCITY = 3.0
+# 1 sigma of heading and position at a start [rad, m]: they are the origin of the world.
+# [chosen: 1e-5 to 1e-3: small against all errors, large enough for the linear algebra]
+_GAUGE_SIGMA = 1e-4
+# Largest 1 sigma of the logarithm of a baseline that starts a graph; a less certain one is a worse
+# first guess than `_GUESSED_SPEED`. [chosen: 0.4 to 1: a factor of two]
+_START_LOG_SIGMA = 0.7
+# Initial speed without a baseline [m/s]: pairs of a global shutter have none. [derived: a walk]
+_GUESSED_SPEED = 1.0
 # Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist, and
-# loops share images (docs/lab/odometry.md).
+# loops share images. With less, states are beyond their covariances: with 1.8 are 19 % of the
+# positions of a phone. [measured: docs/lab/odometry.md, "Pairs in a row", "Noise by innovations"]
 _SHARED = 2.5
-# Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
-# freedom of a wrong start; of one of its pairs, in units of that.
-_CONTRADICTING, _WRONG_START, _GROSS = 4.0, 3.0, 5.0
+# Innovation of a contradicting pair (chi squared per degree of freedom), by the mean of recent
+# ones. A larger gate uses pairs of moving objects, a smaller one rejects right ones: above 4 is
+# one in 800 by chance with 5 degrees of freedom, fewer with 11. [derived: chi squared]
+_CONTRADICTING = 4.0
+# Chi squared of a window per degree of freedom of a wrong start. It must be above that of a right
+# one, which is 1 to 2 where noises are configured too small. [chosen: 2.5 to 4 would do]
+_WRONG_START = 3.0
+# The same of a single pair before the start, in units of that. [measured: there, gross pairs]
+_GROSS = 5.0
 # Number of wrong starts in motion, or of contradicting pairs after a start, after which rest is no
-# start; of pairs that agree after it, in motion, after which axes of the IMU are not in doubt.
-_WRONG_STARTS, _PROVEN = 3, 20
+# start, and pairs and IMU are reported as not of one rig. One may be a moving object.
+# [chosen: 2 to 5 would do]
+_WRONG_STARTS = 3
+# Number of pairs that agree after a start, in motion, after which axes of the IMU are not in
+# doubt: pairs that are wrong together, as of a moving object, look like wrong axes.
+# [measured: docs/lab/odometry.md, "Disturbances": with 20 the object loses no path]
+_PROVEN = 20
 _CONTRADICTION = (
     'pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
     'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?'
 )
-# Longest propagation of a lost path by the IMU, and delay of pairs or samples behind others [s].
-_LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
-# Longest start [s]; then a new one begins.
+# Longest propagation of a lost path by the IMU [s]: later its error is larger than a room.
+# [chosen: 5 to 20 s would do]
+_LONGEST_PROPAGATED = 10.0
+# Longest delay of pairs or samples behind others [s]: more are two clocks. [chosen: 5 to 60 s]
+_LONGEST_DELAY = 10.0
+# Longest start [s]; then a new one begins, without the pairs that were wrong. [chosen: 5 to 15 s]
 _LONGEST_START = 8.0
 _GAP = 'the IMU has a gap, or its clock jumped: see its driver'
-# 1 sigma of an unknown acceleration [m/s^2] and rate [rad/s], of a body whose IMU had a gap.
-_UNKNOWN_ACCELERATION, _UNKNOWN_RATE = 3.0, 1.0
+# 1 sigma of the acceleration [m/s^2] and of the rate [rad/s] of a body whose IMU had a gap.
+# [derived: the most that hands do, `_MOVING_TILT`]
+_UNKNOWN_ACCELERATION = 3.0
+_UNKNOWN_RATE = 1.0
 # Time for which a body has moved until the next start, if the clock was set back [s].
+# [chosen: nobody knows it: a second, as of a driver that restarts]
 _UNKNOWN_TIME = 1.0
-# 1 sigma of the position of the IMU if none is configured, and the least one [m].
-_UNKNOWN_ARM, _LEAST_ARM_SIGMA = 0.15, 1e-4
 # Noise of a single sample of the gyro in units of its density [sqrt(Hz)].
+# [derived: bandwidth of 100 Hz]
 _RATE_NOISE = 10.0
-# Fewest pairs that determine the scale of a start in motion.
+# Fewest pairs that determine the scale of a start in motion. [derived: velocity, tilt and bias are
+# nine unknowns, a pair has five equations; four pairs have some left to contradict]
 _LEAST_PAIRS = 4
+# Cosine of the angle from upside down within which the smallest rotation upwards is not unique.
+_UPSIDE_DOWN = -0.999
 
 
 class _PathEnd(NamedTuple):
@@ -124,7 +179,9 @@ class _Run:
     # Variances of position and heading at the newest pair that was used.
     variances: tuple[float, float] = (0.0, 0.0)
     # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
-    recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
+    recent: deque[tuple[int, float, float]] = field(
+        default_factory=lambda: deque(maxlen=_MOST_RECENT)
+    )
     pairs: int = 0  # used
     largest: float = 0.0  # innovation before the start
     contradicting: int = 0  # not used
@@ -145,28 +202,22 @@ class OdometryEstimator:
     """
 
     def __init__(self, parameters: Parameters, *, keep: bool = False) -> None:
+        self._parameters, self._keep = parameters, keep
         self._config, self._imu = parameters.odometry, parameters.imu
-        lever, sigma = np.array(parameters.imu.imu_position), parameters.imu.imu_position_sigma
         self._R_cam_body = parameters.sensor.R_cam_imu
-        # Position of the camera on the body with its covariance, as known at the next start.
-        self._arm = -self._R_cam_body.T @ lever
-        self._arm_covariance = max(
-            sigma, _LEAST_ARM_SIGMA if lever.any() else _UNKNOWN_ARM
-        ) ** 2 * np.eye(3)
+        # What is not known exactly about camera and IMU, as known at the next start.
+        self._doubts = Doubts(parameters)
+        self._doubted = self._doubts.prior
+        self._doubts_covariance = np.diag(np.square(self._doubts.prior_sigmas))
         self._first_R: Array | None = None  # of the body at the first start: the origin
-        # None until it is known.
-        self.base = (
-            Base()
-            if not self._config.base_frame
-            else None
-            if self._config.base_to_camera is None
-            else Base.of(self._config.base_frame, self._config.base_to_camera)
-        )
+        self.base: Base | None = Base()  # None until it is known
+        if self._config.base_frame:
+            place = self._config.base_to_camera
+            self.base = None if place is None else Base.of(self._config.base_frame, place)
         self._samples = ImuSamples(parameters.imu.max_imu_gap)
         self._gyro = StuckGyro(parameters.imu.stuck_gyro_time)
-        self._keep = keep
         self._camera = ''  # frame_id of the pairs
-        self._waiting: dict[int, KeyframePair] = {}
+        self._waiting: dict[int, PublishedPair] = {}
         self._run: _Run | None = None
         self._last_run: _Run | None = None  # its end is the start of the next path
         self._runs: list[_Run] = []
@@ -174,10 +225,13 @@ class OdometryEstimator:
         self._wrong_starts = 0  # since the last right one in motion
         self._behind = 0  # consecutive samples that came too late
         self._row_ns = 0  # from the stamped to the middle row
-        self._offset_ns = self._watched_ns = 0  # of the camera's clock from that of the IMU
-        # Of the newest frame: its stamp, arrival in IMU time and interval; of the newest pair that
-        # could not be used: its time.
-        self._frame_ns = self._arrived_ns = self._frame_interval_ns = self._unusable_ns = 0
+        self._offset_ns = 0  # of the camera's clock from that of the IMU
+        self._watched_ns = 0  # time of the newest sample at which overdue pairs were looked for
+        # Of the newest frame: its stamp, arrival in IMU time and interval.
+        self._frame_ns = 0
+        self._arrived_ns = 0
+        self._frame_interval_ns = 0
+        self._unusable_ns = 0  # time of the newest pair that could not be used
         self._longest_interval = parameters.keyframes.max_keyframe_interval
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
         self.intervals: list[StateInterval] = []  # with `keep`
@@ -186,9 +240,9 @@ class OdometryEstimator:
         # Numbers of pairs and runs by outcome.
         self.counts: Counter[str] = Counter()
         self._warnings: list[Notice] = []
-        if not lever.any():
+        if not self._doubts.arm_is_known:
             text = (
-                f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m of uncertainty; '
+                f'imu_position is zero: it is estimated, from {UNKNOWN_ARM} m of uncertainty; '
                 'a measured one is better'
             )
             self._warnings.append(Notice(text))
@@ -221,28 +275,26 @@ class OdometryEstimator:
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
         newest = self._samples.both_until_ns
-        self._behind = (
-            self._behind + 1 if newest is not None and sample.stamp_ns < newest - _LATE_NS else 0
-        )
+        too_late = newest is not None and sample.stamp_ns < newest - _LATE_NS
+        self._behind = self._behind + 1 if too_late else 0
         if newest is not None and self._behind == _SET_BACK:
             self._end('the clock of the IMU was set back', newest)
             self._behind = self._watched_ns = 0
             self._samples.clear()
             self._waiting, self._last_ns = {}, None
-        elif self._behind:
-            return  # too late for any pair
+        elif too_late:
+            return  # for any pair
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
-        if sample.stamp_ns >= self._watched_ns + _WATCH_NS:
-            self._watched_ns = sample.stamp_ns
-            self._samples.prune(
-                sample.stamp_ns
-                - to_nanoseconds(max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY)
-            )
-            try:
-                self._watch(sample.stamp_ns)
-            except GraphError as error:
-                self._end(str(error), sample.stamp_ns)
+        if sample.stamp_ns < self._watched_ns + _WATCH_NS:
+            return
+        self._watched_ns = sample.stamp_ns
+        kept = max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY
+        self._samples.prune(sample.stamp_ns - to_nanoseconds(kept))
+        try:
+            self._watch(sample.stamp_ns)
+        except GraphError as error:
+            self._end(str(error), sample.stamp_ns)
 
     def imu_is_silent(self, seconds: float) -> None:
         """Tell that no sample has come for some time; the next ones decide whether it is a gap."""
@@ -257,7 +309,7 @@ class OdometryEstimator:
         self._frame_ns, self._frame_interval_ns = stamp_ns, max(stamp_ns - self._frame_ns, 0)
         self._arrived_ns = self._samples.newest_ns or 0
 
-    def add_pair(self, pair: KeyframePair) -> None:
+    def add_pair(self, pair: PublishedPair) -> None:
         """Add a pair; one without information is only counted.
 
         InputError for another camera, and for another clock than that of the samples.
@@ -272,7 +324,7 @@ class OdometryEstimator:
         self.counts['pairs'] += 1
         newest_ns = self._samples.both_until_ns
         if newest_ns is not None:
-            late = seconds_between(pair.current_ns, newest_ns)
+            late = seconds_between(pair.current_imu_ns, newest_ns)
             if abs(late) > _LONGEST_DELAY:
                 self.counts['late'] += 1
                 raise InputError(
@@ -280,18 +332,18 @@ class OdometryEstimator:
                     f'{abs(late):.0f} s from those of the newest samples: camera and '
                     'IMU must have one clock; was one of them set?'
                 )
-        if pair.images is None and not pair.contradiction:
+        if pair.images is None and contradiction(pair) is None:
             self.counts['without images'] += 1
-            self._unusable_ns = pair.current_ns
+            self._unusable_ns = pair.current_imu_ns
             return
         if pair.images is not None:
-            self._row_ns = pair.row_ns
+            self._row_ns = row_ns(pair)
         # Keyframes are at the middle rows, also for pairs without information.
-        pair = pair.later(self._row_ns).without_far_velocities()
-        if self._last_ns is not None and pair.current_ns <= self._last_ns:
+        pair = without_far_velocities(later(pair, self._row_ns))
+        if self._last_ns is not None and pair.current_imu_ns <= self._last_ns:
             self.counts['late'] += 1
             return
-        self._waiting[pair.current_ns] = pair
+        self._waiting[pair.current_imu_ns] = pair
         if len(self._waiting) > _MOST_WAITING:
             self.counts['dropped'] += _MOST_WAITING
             newest = max(self._waiting)
@@ -311,19 +363,20 @@ class OdometryEstimator:
     def take(self, *, end: bool = False, most: int | None = None) -> list[Odometry]:
         """Finished keyframes, of at most `most` pairs; with `end`, no more input follows."""
         out: list[Odometry] = []
-        for _ in range(len(self._waiting) if most is None else min(most, len(self._waiting))):
+        while self._waiting and most != 0:
             pair = self._waiting[min(self._waiting)]
             if not (end or self._ready(pair)):
                 break
-            del self._waiting[pair.current_ns]
-            self._last_ns = pair.current_ns
+            del self._waiting[pair.current_imu_ns]
+            self._last_ns = pair.current_imu_ns
             try:
                 found = self._process(pair)
             except GraphError as error:
                 found = None
-                self._end(str(error), pair.current_ns)
+                self._end(str(error), pair.current_imu_ns)
             if found is not None:
                 out.append(found)
+            most = None if most is None else most - 1
         return out
 
     def propagated(self, imu_ns: int) -> Odometry | None:
@@ -335,9 +388,8 @@ class OdometryEstimator:
         if interval is None:
             return None
         stamp_ns = run.stamps[-1][0] + imu_ns - run.newest_ns
-        return self._odometry(
-            run, run.graph.propagated(interval), interval.rates[-1], stamp_ns, imu_ns
-        )
+        state = run.graph.propagated(interval)
+        return self._odometry(run, state, interval.rates[-1], stamp_ns, imu_ns)
 
     def smoothed(self) -> list[Odometry]:
         """All keyframes, given all measurements; needs `keep`."""
@@ -357,35 +409,31 @@ class OdometryEstimator:
                     Notice(f'not smoothed: {len(run.stamps)} keyframes: {error}')
                 )
                 continue
-            out.append(
-                [
-                    (state, self._odometry(run, state, np.full(3, math.nan), *stamps))
-                    for state, stamps in zip(states, run.stamps, strict=True)
-                ]
-            )
+            unknown_rate = np.full(3, math.nan)
+            path = []
+            for state, stamps in zip(states, run.stamps, strict=True):
+                path.append((state, self._odometry(run, state, unknown_rate, *stamps)))
+            out.append(path)
         return out
 
-    def close_loops(self, pairs: Iterable[KeyframePair]) -> list[KeyframePair]:
+    def close_loops(self, pairs: Iterable[PublishedPair]) -> list[PublishedPair]:
         """Add pairs of keyframes far apart in time to what is smoothed; needs `keep`.
 
         Returns those that agree with the path and count, at their middle rows. Pairs of two runs
         do not.
         """
-        loops = [loop for pair in pairs if (loop := pair.as_loop(_SHARED)) is not None]
-        taken: list[KeyframePair] = []
+        loops = [as_loop(pair, _SHARED) for pair in pairs]
+        taken: list[PublishedPair] = []
         for run in self._runs:
             numbers = {imu_ns: k for k, (_, imu_ns) in enumerate(run.stamps)}
+            of_run = [
+                Loop(numbers[pair.reference_imu_ns], numbers[pair.current_imu_ns], pair)
+                for pair in loops
+                if pair is not None
+                and {pair.reference_imu_ns, pair.current_imu_ns} <= numbers.keys()
+            ]
             try:
-                taken += [
-                    loop.pair
-                    for loop in run.graph.add_loops(
-                        [
-                            Loop(numbers[pair.reference_ns], numbers[pair.current_ns], pair)
-                            for pair in loops
-                            if {pair.reference_ns, pair.current_ns} <= numbers.keys()
-                        ]
-                    )
-                ]
+                taken += [loop.pair for loop in run.graph.add_loops(of_run)]
             except GraphError as error:
                 text = f'loops of {len(run.stamps)} keyframes not added: {error}'
                 self._warnings.append(Notice(text))
@@ -393,34 +441,27 @@ class OdometryEstimator:
 
     # -- pairs -------------------------------------------------------------------------------
 
-    def _ready(self, pair: KeyframePair) -> bool:
+    def _ready(self, pair: PublishedPair) -> bool:
         """Whether no late sample can change the outcome of a pair."""
         newest = self._samples.both_until_ns
-        if newest is None or newest < pair.current_ns:
+        if newest is None or newest < pair.current_imu_ns:
             return False
-        if newest >= pair.current_ns + _LATE_NS:
+        if newest >= pair.current_imu_ns + _LATE_NS:
             return True
         return (
             self._run is not None
-            and abs(pair.reference_ns - self._run.newest_ns) < _SAME_NS
-            and self._samples.complete(pair.reference_ns, pair.current_ns)
+            and abs(pair.reference_imu_ns - self._run.newest_ns) < _SAME_NS
+            and self._samples.complete(pair.reference_imu_ns, pair.current_imu_ns)
         )
 
-    def _process(self, pair: KeyframePair) -> Odometry | None:
-        self._offset_ns = pair.stamp_ns - pair.current_ns
-        # Pairs that are wrong together, as of a moving object, do not disprove axes.
-        proven = self._run is not None and self._run.confirmed >= _PROVEN
-        contradiction = pair.contradiction
-        if contradiction and not (proven and contradiction.code is Code.ACCEL_AXES):
-            reason = findings_text.item(contradiction)
-            self._end(reason, pair.current_ns)
-            self._change(OdometryState.LOST, reason, pair.current_ns)
-            self.counts['calibration contradicted'] += 1
+    def _process(self, pair: PublishedPair) -> Odometry | None:
+        self._offset_ns = pair.stamp_ns - pair.current_imu_ns
+        if self._is_contradicted(pair):
             return None
         if pair.images is None:
-            self._unusable_ns = pair.current_ns
+            self._unusable_ns = pair.current_imu_ns
             return None
-        if self._run is not None and pair.reference_ns < self._run.newest_ns - _SAME_NS:
+        if self._run is not None and pair.reference_imu_ns < self._run.newest_ns - _SAME_NS:
             self.counts['late'] += 1  # the IMU bridges it
             return None
         run = self._continued(pair)
@@ -428,73 +469,87 @@ class OdometryEstimator:
             run = self._run = self._new_run(pair)
         if run is None:
             return None
-        interval = self._samples.between(run.newest_ns, pair.current_ns)
+        interval = self._samples.between(run.newest_ns, pair.current_imu_ns)
         if interval is None:
-            self._end(_GAP, pair.current_ns)
+            self._end(_GAP, pair.current_imu_ns)
             return None
-        at_rest = pair.is_pure_rotation and interval.at_rest
+        self._add(run, pair, interval)
+        if self._run is None or not (run.published or self._known(run)):
+            return None
+        self._corrections += 1
+        state, rate = run.graph.newest, interval.rates[-1]
+        return self._odometry(run, state, rate, pair.stamp_ns, pair.current_imu_ns)
+
+    def _is_contradicted(self, pair: PublishedPair) -> bool:
+        """Whether a finding on the calibration ends the path."""
+        finding = contradiction(pair)
+        if finding is None:
+            return False
+        # Pairs that are wrong together, as of a moving object, do not disprove axes.
+        proven = self._run is not None and self._run.confirmed >= _PROVEN
+        if proven and finding.code is Code.ACCEL_AXES:
+            return False
+        reason = findings_text.item(finding)
+        self._end(reason, pair.current_imu_ns)
+        self._change(OdometryState.LOST, reason, pair.current_imu_ns)
+        self.counts['calibration contradicted'] += 1
+        return True
+
+    def _add(self, run: _Run, pair: PublishedPair, interval: ImuInterval) -> None:
+        """Add a keyframe at the pair's current image, and the pair if it agrees with the path."""
+        at_ns = pair.current_imu_ns
         # Pairs that deviate together are wrong together: their covariance is too small by that.
-        recent = [
-            innovation
-            for at_ns, innovation, _ in run.recent
-            if at_ns > pair.current_ns - _RECENT_NS
-        ]
+        recent = [one for when, one, _ in run.recent if when > at_ns - _RECENT_NS]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
         # The gyro predicts a rotation before the scale is known.
-        gate = inflation * _CONTRADICTING if run.published or pair.is_pure_rotation else math.inf
+        gated = run.published or pair.is_pure_rotation
+        gate = inflation * _CONTRADICTING if gated else math.inf
+        at_rest = pair.is_pure_rotation and interval.at_rest
         innovation = run.graph.add(
             interval, pair, at_rest, inflation=_SHARED * inflation, gate=gate
         )
-        run.stamps.append((pair.stamp_ns, pair.current_ns))
-        run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
+        run.stamps.append((pair.stamp_ns, at_ns))
+        run.recent.append((at_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
             self._corrections += 1
             self._reject(run, pair)
-            if self._run is None:
-                return None
-        else:
-            run.observed_ns, run.pairs = pair.current_ns, run.pairs + 1
-            run.largest = max(run.largest, innovation)
-            run.confirmed += run.published and pair.has_direction
-            run.variances = _variances(run.graph.newest)
-            if run.published:
-                self._change(OdometryState.TRACKING, '', pair.current_ns)
-        if not run.published and not self._known(run):
-            return None
-        self._corrections += 1
-        return self._odometry(
-            run, run.graph.newest, interval.rates[-1], pair.stamp_ns, pair.current_ns
-        )
+            return
+        run.observed_ns, run.pairs = at_ns, run.pairs + 1
+        run.largest = max(run.largest, innovation)
+        run.confirmed += run.published and pair.has_direction
+        run.variances = _variances(run.graph.newest)
+        if run.published:
+            self._change(OdometryState.TRACKING, '', at_ns)
 
-    def _reject(self, run: _Run, pair: KeyframePair) -> None:
+    def _reject(self, run: _Run, pair: PublishedPair) -> None:
         """Count a pair that contradicts the path, which ends if too many do."""
         self.counts['contradicting'] += 1
-        self._unusable_ns = pair.current_ns
+        self._unusable_ns = pair.current_imu_ns
         run.contradicting += 1
         if not run.published:
             self._count_wrong_start()
         elif not run.confirmed and run.contradicting == _WRONG_STARTS:
             self._wrong_starts = _WRONG_STARTS
-            self._end(_CONTRADICTION, pair.current_ns)
-        elif seconds_between(run.observed_ns, pair.current_ns) > self._config.max_coast:
-            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_ns)
+            self._end(_CONTRADICTION, pair.current_imu_ns)
+        elif seconds_between(run.observed_ns, pair.current_imu_ns) > self._config.max_coast:
+            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_imu_ns)
 
-    def _continued(self, pair: KeyframePair) -> _Run | None:
+    def _continued(self, pair: PublishedPair) -> _Run | None:
         """The run with a keyframe at the pair's reference; None if it has ended."""
         run = self._run
-        if run is None or abs(run.newest_ns - pair.reference_ns) < _SAME_NS:
+        if run is None or abs(run.newest_ns - pair.reference_imu_ns) < _SAME_NS:
             return run
-        if seconds_between(run.observed_ns, pair.reference_ns) > self._config.max_coast:
-            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.reference_ns)
+        if seconds_between(run.observed_ns, pair.reference_imu_ns) > self._config.max_coast:
+            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.reference_imu_ns)
             return None
-        interval = self._samples.between(run.newest_ns, pair.reference_ns)
+        interval = self._samples.between(run.newest_ns, pair.reference_imu_ns)
         if interval is None:
-            self._end(_GAP, pair.reference_ns)
+            self._end(_GAP, pair.reference_imu_ns)
             return None
         # A pair is missing: the IMU bridges it.
         run.graph.add(interval, None, at_rest=False)
-        offset = pair.current_ns - pair.stamp_ns
-        run.stamps.append((pair.reference_ns - offset, pair.reference_ns))
+        offset = pair.current_imu_ns - pair.stamp_ns
+        run.stamps.append((pair.reference_imu_ns - offset, pair.reference_imu_ns))
         return run
 
     def _watch(self, imu_ns: int) -> None:
@@ -541,62 +596,74 @@ class OdometryEstimator:
 
     # -- start and end -----------------------------------------------------------------------
 
-    def _new_run(self, pair: KeyframePair) -> _Run | None:
+    def _new_run(self, pair: PublishedPair) -> _Run | None:
         """A run that starts at the pair's reference; None if the pair cannot start one."""
-        interval = self._samples.between(pair.reference_ns, pair.current_ns)
-        before = self._samples.up_to(pair.reference_ns, _GRAVITY_WINDOW)
+        interval = self._samples.between(pair.reference_imu_ns, pair.current_imu_ns)
         if pair.images is None or interval is None or self.base is None:
             return None
         at_rest = pair.is_pure_rotation and interval.at_rest
-        if self._wrong_starts >= _WRONG_STARTS if at_rest else not pair.has_direction:
+        # Axes of the IMU do not show at rest.
+        possible = self._wrong_starts < _WRONG_STARTS if at_rest else pair.has_direction
+        if not possible:
             return None
-        moving = (
-            pair.baseline * pair.images.velocities[:3]
-            if pair.baseline_log_sigma < _START_LOG_SIGMA
-            else _GUESSED_SPEED * pair.images.t
+        path_end = self._path_end_at(pair.reference_imu_ns)
+        start = self._start(pair, interval, path_end, at_rest)
+        graph = KeyframeGraph(start, self._doubts, self._parameters, keep=self._keep)
+        self._first_R = start.R if self._first_R is None else self._first_R
+        offset = pair.current_imu_ns - pair.stamp_ns
+        first = pair.reference_imu_ns - offset, pair.reference_imu_ns
+        return _Run(
+            graph=graph,
+            path_end=path_end,
+            at_rest=at_rest,
+            first_ns=pair.reference_imu_ns,
+            observed_ns=pair.reference_imu_ns,
+            stamps=deque([first], maxlen=None if self._keep else 1),
+            frame_id=self.base.frame_id or pair.frame_id,
         )
+
+    def _start(
+        self, pair: PublishedPair, interval: ImuInterval, path_end: _PathEnd, at_rest: bool
+    ) -> KeyframeState:
+        """The body at the pair's reference, with the covariance of a start."""
+        assert self.base is not None and pair.images is not None
         bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
-        rate = interval.rates[0] - bias
+        before = self._samples.up_to(pair.reference_imu_ns, _GRAVITY_WINDOW)
         if at_rest or before is None or before.duration < interval.duration:
             # Rotated back by the gyro over the interval.
             back = ImuInterval(interval.seconds, -interval.rates[::-1], interval.forces[::-1])
             force = back.mean_force(-bias)
         else:
             force = before.mean_force(bias)
-        path_end = self._path_end_at(pair.reference_ns)
-        C = self._R_cam_body
+        C = self._doubts.R_cam_body(self._doubted)
+        # The base keeps its heading; without one the body does.
         R = _levelled(force, path_end, self.base.R @ C if self.base.frame_id else np.eye(3))
-        velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, self._arm))
+        velocity = np.zeros(3)
+        if not at_rest:
+            moving = _GUESSED_SPEED * pair.images.t
+            if pair.baseline_log_sigma < _START_LOG_SIGMA:
+                moving = pair.baseline * pair.images.velocities[:3]
+            swing = np.cross(interval.rates[0] - bias, self._doubted[:3])
+            velocity = R @ (C.T @ moving - swing)
         of_bias = max(self._imu.accel_bias_sigma, _ACCEL_BIAS)
         tilt = of_bias / STANDARD_GRAVITY if at_rest else _MOVING_TILT
-        covariance = np.diag(
-            np.square(
-                [_GAUGE_SIGMA] * 6
-                + [_REST_VELOCITY if at_rest else _ANY_VELOCITY] * 3
-                + [of_bias] * 3
-                + [self._imu.gyro_bias_sigma] * 3
-                + [0.0] * 3
-            )
-        )
+        size = BIAS.stop + len(self._doubted)
+        covariance = np.zeros((size, size))
         covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _GAUGE_SIGMA])) @ R
-        covariance[ARM, ARM] = self._arm_covariance
-        start = KeyframeState(
-            R, path_end.position, velocity, bias, np.zeros(3), self._arm, covariance
-        )
-        graph = KeyframeGraph(start, C, self._imu, self._config, keep=self._keep)
-        self._first_R = R if self._first_R is None else self._first_R
-        offset = pair.current_ns - pair.stamp_ns
-        stamps = deque(
-            [(pair.reference_ns - offset, pair.reference_ns)], maxlen=None if self._keep else 1
-        )
-        return _Run(
-            graph,
-            path_end,
-            at_rest,
-            pair.reference_ns,
-            pair.reference_ns,
-            stamps,
-            self.base.frame_id or pair.frame_id,
+        covariance[3:6, 3:6] = _GAUGE_SIGMA**2 * np.eye(3)
+        of_velocity = _REST_VELOCITY if at_rest else _ANY_VELOCITY
+        covariance[VELOCITY, VELOCITY] = of_velocity**2 * np.eye(3)
+        of_biases = np.repeat([of_bias, self._imu.gyro_bias_sigma], 3)
+        covariance[BIAS, BIAS] = np.diag(np.square(of_biases))
+        covariance[DOUBTS, DOUBTS] = self._doubts_covariance
+        return KeyframeState(
+            R=R,
+            position=path_end.position,
+            velocity=velocity,
+            gyro_bias=bias,
+            accel_bias=np.zeros(3),
+            doubts=self._doubted,
+            covariance=covariance,
         )
 
     def _path_end_at(self, imu_ns: int) -> _PathEnd:
@@ -608,33 +675,27 @@ class OdometryEstimator:
         interval = self._samples.between(run.newest_ns, imu_ns)
         # Uncertainty of earlier losses remains.
         earlier = run.path_end
-        variance = (
-            earlier.position_sigma**2
-            + earlier.heading_sigma**2
-            * float(((state.position - earlier.position)[:2] ** 2).sum())
-            / 3.0
-        )
+        moved_since = (state.position - earlier.position)[:2]
+        by_heading = earlier.heading_sigma**2 * float((moved_since**2).sum()) / 3.0
+        variance = earlier.position_sigma**2 + by_heading
         turned = moved = 0.0
         if interval is not None and seconds <= _LONGEST_PROPAGATED:
             state = run.graph.propagated(interval)
         elif abs(seconds) > _SAME_NS / NANOSECONDS:  # else the keyframe itself: no gap
-            # On at the same velocity; for an unknown time if the clock was set back.
-            way = max(seconds, 0.0) * state.velocity
-            unknown = (
-                0.0 if seconds > 0.0 else _UNKNOWN_TIME * float(np.linalg.norm(state.velocity))
-            )
-            seconds = seconds if seconds > 0.0 else _UNKNOWN_TIME
+            unknown = 0.0
+            if seconds > 0.0:  # on at the same velocity
+                state = replace(state, position=state.position + seconds * state.velocity)
+            else:  # the clock was set back: for an unknown time
+                seconds = _UNKNOWN_TIME
+                unknown = seconds * float(np.linalg.norm(state.velocity))
             turned = _UNKNOWN_RATE * seconds
             moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2 + unknown
-            state = replace(state, position=state.position + way)
-            variance += seconds**2 * float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
+            of_velocity = float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
+            variance += seconds**2 * of_velocity
         of_position, of_heading = _variances(state)
-        return _PathEnd(
-            state.R,
-            state.position,
-            min(math.hypot(earlier.heading_sigma, math.sqrt(of_heading), turned), math.pi),
-            math.sqrt(variance + of_position / 3.0 + moved**2),
-        )
+        heading_sigma = math.hypot(earlier.heading_sigma, math.sqrt(of_heading), turned)
+        position_sigma = math.sqrt(variance + of_position / 3.0 + moved**2)
+        return _PathEnd(state.R, state.position, min(heading_sigma, math.pi), position_sigma)
 
     def _known(self, run: _Run) -> bool:
         """Whether the scale of a starting run is known."""
@@ -652,23 +713,28 @@ class OdometryEstimator:
                 self._count_wrong_start()
                 return False
             if sigma < self._config.max_scale_sigma:
-                run.published = True
-                if not run.at_rest:
-                    self._wrong_starts = 0
-                self.starts.append(StartReport(run.at_rest, run.newest_ns, seconds, sigma))
-                run.path = len(self.starts) - 1
-                if self._keep:
-                    self._runs.append(run)
-                self._change(
-                    OdometryState.TRACKING,
-                    f'started {"at rest" if run.at_rest else "in motion"} after {seconds:.1f} s, '
-                    f'the scale is known to {100.0 * sigma:.1f} %',
-                    run.newest_ns,
-                )
+                self._publish(run, StartReport(run.at_rest, run.newest_ns, seconds, sigma))
                 return True
         if seconds > _LONGEST_START:
             self._run = None
         return False
+
+    def _publish(self, run: _Run, start: StartReport) -> None:
+        """Start to publish a run."""
+        run.published = True
+        if not run.at_rest:
+            self._wrong_starts = 0
+        self.starts.append(start)
+        run.path = len(self.starts) - 1
+        if self._keep:
+            self._runs.append(run)
+        how = 'at rest' if run.at_rest else 'in motion'
+        self._change(
+            OdometryState.TRACKING,
+            f'started {how} after {start.seconds:.1f} s, the scale is known to '
+            f'{100.0 * start.scale_sigma:.1f} %',
+            run.newest_ns,
+        )
 
     def _count_wrong_start(self) -> None:
         self._wrong_starts += 1
@@ -682,7 +748,8 @@ class OdometryEstimator:
             self.counts['lost'] += 1
             self._last_run = run
             newest = run.graph.newest
-            self._arm, self._arm_covariance = newest.arm, newest.covariance[ARM, ARM]
+            self._doubted = newest.doubts
+            self._doubts_covariance = newest.covariance[DOUBTS, DOUBTS]
             self._change(OdometryState.LOST, reason, imu_ns)
 
     def _change(self, state: OdometryState, reason: str, imu_ns: int) -> None:
@@ -706,57 +773,87 @@ class OdometryEstimator:
     @property
     def imu_position(self) -> tuple[Array, Array]:
         """Position of the IMU in the camera frame with 1 sigma per axis [m], as estimated."""
-        C, arm, covariance = self._R_cam_body, self._arm, self._arm_covariance
-        if self._run is not None:
-            newest = self._run.graph.newest
-            arm, covariance = newest.arm, newest.covariance[ARM, ARM]
-        return -C @ arm, np.sqrt(np.diag(C @ covariance @ C.T))
+        C = self._R_cam_body
+        d, covariance = self._known_doubts()
+        return -C @ d[:3], np.sqrt(np.diag(C @ covariance[:3, :3] @ C.T))
+
+    @property
+    def deviations(self) -> dict[str, tuple[list[float], list[float]]]:
+        """Values and sigmas of the deviations of the configuration that are unknown, by name."""
+        return self._doubts.named(*self._known_doubts())
+
+    def _known_doubts(self) -> tuple[Array, Array]:
+        """The vector of `doubts` with its covariance."""
+        if self._run is None:
+            return self._doubted, self._doubts_covariance
+        newest = self._run.graph.newest
+        return newest.doubts, newest.covariance[DOUBTS, DOUBTS]
 
     def _odometry(
         self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int, imu_ns: int
     ) -> Odometry:
+        """The base, or the camera without one, of the body at a time; `rate` (3,) of the gyro."""
         base, first_R = self.base, self._first_R
         assert base is not None and first_R is not None
         # The base on the body, as the camera: its rotation and position.
-        C = base.R @ self._R_cam_body
+        R_cam_body = self._doubts.R_cam_body(state.doubts)
+        C = base.R @ R_cam_body
         c = state.arm - C.T @ base.position
         rate = rate - state.gyro_bias
-        # It is at the origin at first: p + (R - R_first) c, in the world.
-        to_world, to_twist = np.zeros((6, 18)), np.zeros((6, 18))
-        to_world[:3, :3], to_world[:3, 3:6] = -state.R @ skew(c), state.R
-        to_world[3:, :3], to_world[:3, ARM] = state.R, state.R - first_R
         R = state.R @ C.T
-        to_twist[:3, :3], to_twist[:3, VELOCITY] = C @ skew(state.R.T @ state.velocity), R.T
+        # It is at the origin at first: p + (R - R_first) c, in the world.
+        moved = state.R - first_R
+        position = state.position + moved @ c
+        # The camera's axes turn the base about the camera: derivatives by these axes.
+        axes_on_body = -R_cam_body.T
+        arm_by_axes = axes_on_body @ skew(base.R.T @ base.position)
+        n = len(state.covariance)
+        by_axes = np.zeros((3, n))
+        by_axes[:, ARM.stop :] = self._doubts.by_mount[:3]
+        to_world, to_twist = np.zeros((6, n)), np.zeros((6, n))
+        to_world[:3, :3] = -state.R @ skew(c)
+        to_world[:3, 3:6] = state.R
+        to_world[:3, ARM] = moved
+        to_world[:3] += moved @ arm_by_axes @ by_axes
+        to_world[3:, :3] = state.R
+        to_world[3:] += state.R @ axes_on_body @ by_axes
+        velocity_on_body = state.R.T @ state.velocity
+        velocity = R.T @ (state.velocity + state.R @ skew(rate) @ c)
+        to_twist[:3, :3] = C @ skew(velocity_on_body)
+        to_twist[:3, VELOCITY] = R.T
         to_twist[:3, ARM] = C @ skew(rate)
-        to_twist[:3, GYRO_BIAS], to_twist[3:, GYRO_BIAS] = C @ skew(c), -C
+        to_twist[:3, GYRO_BIAS] = C @ skew(c)
+        to_twist[3:, GYRO_BIAS] = -C
+        to_twist[:3] += (C @ skew(rate) @ arm_by_axes - skew(velocity) @ base.R) @ by_axes
+        to_twist[3:] -= skew(C @ rate) @ base.R @ by_axes
         by_rate = to_twist[:, GYRO_BIAS] * self._imu.gyro_noise_density * _RATE_NOISE
-        velocity = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
+        twist_covariance = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
         # A later start has position and heading from the end of the path before.
-        position, up = state.position + (state.R - first_R) @ c, np.array([0.0, 0.0, 1.0])
-        by_heading = run.path_end.heading_sigma * np.concatenate(
-            [skew(up) @ (state.position + state.R @ c - run.path_end.position), up]
-        )
+        up = np.array([0.0, 0.0, 1.0])
+        from_end = state.position + state.R @ c - run.path_end.position
+        by_heading = run.path_end.heading_sigma * np.concatenate([skew(up) @ from_end, up])
         covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
         covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
         return Odometry(
-            stamp_ns,
-            imu_ns,
-            run.frame_id,
-            run.path,
-            self._corrections,
-            R,
-            position,
-            covariance,
-            R.T @ (state.velocity + state.R @ skew(rate) @ c),
-            C @ rate,
-            velocity,
+            stamp_ns=stamp_ns,
+            imu_ns=imu_ns,
+            frame_id=run.frame_id,
+            path=run.path,
+            corrections=self._corrections,
+            R=R,
+            position=position,
+            pose_covariance=covariance,
+            velocity=velocity,
+            angular_velocity=C @ rate,
+            velocity_covariance=twist_covariance,
         )
 
 
 def _variances(state: KeyframeState) -> tuple[float, float]:
     """Variances of the position (its length) and of the heading."""
     up, covariance = state.R[2], state.covariance[POSE, POSE]
-    return float(np.trace(covariance[3:, 3:])), float(up @ covariance[:3, :3] @ up)
+    of_heading = up @ covariance[:3, :3] @ up
+    return float(np.trace(covariance[3:, 3:])), float(of_heading)
 
 
 def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
@@ -766,12 +863,11 @@ def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
     """
     up = axes @ force / np.linalg.norm(force)
     # The smallest rotation that takes it upwards, then one about z to the last heading.
-    turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
-    R = (
-        np.eye(3) + turn + turn @ turn / (1.0 + up[2])
-        if up[2] > -0.999
-        else np.diag([1.0, -1.0, -1.0])
-    )
+    if up[2] > _UPSIDE_DOWN:
+        turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
+        R = np.eye(3) + turn + turn @ turn / (1.0 + up[2])
+    else:
+        R = np.diag([1.0, -1.0, -1.0])
     R = R @ axes
     if path_end.R is not None:
         R = exp_so3(heading(path_end.R @ R.T)) @ R

@@ -1,9 +1,9 @@
 """The graph of keyframes in gtsam, and the window of it that is optimised as keyframes arrive.
 
 States of a keyframe: pose and velocity of the body (the IMU) in a world with z up, and the biases;
-of all keyframes: the position of the camera on the body. Factors: the preintegrated IMU between
-consecutive keyframes, and for a pair the information of its images alone (`estimator.covariance`),
-so that no IMU sample counts twice.
+of all keyframes: the vector of `doubts`. Factors: the preintegrated IMU between consecutive
+keyframes, and for a pair the information of its images alone (`estimator.covariance`), so that no
+IMU sample counts twice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,48 +17,85 @@ from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
 from scipy.special import gammaincinv
 
-from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
+from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig, Parameters
+from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import skew, STANDARD_GRAVITY
 from rs_relpose_ros.imu.buffer import ImuInterval
-from rs_relpose_ros.odometry.pair import deviations, KeyframePair, square_root
-
-# 1 sigma of the velocity of a body at rest [m/s], per axis.
-_REST_VELOCITY_SIGMA = 0.005
-# Speed [m/s] below which the uncertainty of a velocity is relative to it.
-_LEAST_SPEED = 0.1
-# Largest share of the window that one interval takes.
-_LONGEST_STEP = 0.25
-# Steps of the optimisation with a keyframe until the start; then one changes no path by 0.2 mm.
-_START_STEPS = 10
-# Errors of an accelerometer that its noise density has not (scale, axes, vibration, clock), as
-# another density [m/s^2/sqrt(Hz)], and variances of pairs by those of their images: values that
-# innovations choose from, with 1 sigma of the former and of the logarithm of the latter before
-# them; time in which they are forgotten [s] (docs/lab/odometry.md, "Noise by innovations").
-_ACCEL_ERRORS = np.array([0.0, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])[:, None]
-_PAIR_VARIANCES = np.array([0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
-_LIKELY = -0.5 * ((_ACCEL_ERRORS / 8e-3) ** 2 + (np.log(_PAIR_VARIANCES) / 0.7) ** 2)
-_FORGOTTEN = 20.0
-# Largest share of one pair in that choice, as a difference of log likelihoods.
-_ONE_PAIR = 6.0
-# Integration error of the samples, as a noise density of the position [m/sqrt(s)].
-_INTEGRATION = 1e-4
-# Share of right loops within the bound of chi squared.
-_LOOP_QUANTILE = 0.99
-
-# Columns of a pair's derivatives: pose and velocity of the first body, of the second one, camera.
-_BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18), slice(18, 21))
-# Columns of the derivatives of an IMU factor by its first body with biases, and by its second one.
-_OF_FIRST, _OF_SECOND = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
-# Columns of the covariance of a keyframe.
-POSE, VELOCITY, BIAS, GYRO_BIAS, ARM = (
-    slice(0, 6),
-    slice(6, 9),
-    slice(9, 15),
-    slice(12, 15),
-    slice(15, 18),
+from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.odometry import doubts
+from rs_relpose_ros.odometry.doubts import Doubts
+from rs_relpose_ros.odometry.pair import (
+    Body,
+    COLUMNS,
+    deviations,
+    Measured,
+    Mount,
+    square_root,
 )
+
+# 1 sigma of the velocity of a body at rest [m/s], per axis. A smaller one holds a body that
+# creeps; a larger one lets the path drift at rest. [chosen: 2 to 10 mm/s: a hand that holds still]
+_REST_VELOCITY_SIGMA = 0.005
+# Speed [m/s] below which the uncertainty of a velocity is taken relative to this speed: relative
+# to 2 cm/s each sigma is large, and no slow camera would start; without it wrong starts happened
+# in slow motion. [measured: docs/lab/odometry.md, "Starts", slow motion]
+_LEAST_SPEED = 0.1
+# Largest share of the window that one interval takes. A longer bridge would push the states before
+# it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
+_LONGEST_STEP = 0.25
+# Steps of the optimisation with a keyframe until the start, where the linearisation is far off.
+# [measured: with 10 another one changes no path by 0.2 mm, docs/lab/odometry.md]
+_START_STEPS = 10
+# Densities [m/s^2/sqrt(Hz)] of errors of an accelerometer that its noise has not (scale, axes,
+# vibration, clock), from which innovations choose.
+# [measured: docs/lab/odometry.md, "Noise by innovations": 0 to 27e-3 on seven recordings]
+_ACCEL_ERRORS = np.array([0.0, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])[:, None]
+# 1 sigma of that density before any innovation. [measured: there, starts of recordings]
+_ACCEL_ERROR_SIGMA = 8e-3
+# Variances of pairs by those of their images, from which innovations choose. [measured: there:
+# 0.5 to 3.9]
+_PAIR_VARIANCES = np.array([0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
+# 1 sigma of the logarithm of that variance before any innovation. [measured: there]
+_PAIR_LOG_SIGMA = 0.7
+_LIKELY = -0.5 * (
+    (_ACCEL_ERRORS / _ACCEL_ERROR_SIGMA) ** 2 + (np.log(_PAIR_VARIANCES) / _PAIR_LOG_SIGMA) ** 2
+)
+# Time in which innovations are forgotten [s]. A shorter one follows a change of the motion, with
+# fewer innovations to choose by. [chosen: 10 to 60 s would do]
+_FORGOTTEN = 20.0
+# Largest share of one pair in that choice, as a difference of log likelihoods: a single wrong pair
+# must not decide. [chosen: 3 to 10 would do: the prior of the extreme values is 2 to 8]
+_ONE_PAIR = 6.0
+# Integration error of the samples, as a noise density of the position [m/sqrt(s)]: the mean of two
+# samples is not the mean of the acceleration between them. [chosen: 0.1 mm after a second, below
+# the noise of any accelerometer]
+_INTEGRATION = 1e-4
+# Share of right loops within the bound of chi squared: 1 % of them are lost.
+# [chosen: 0.95 to 0.999 would do; measured with 0.99 in docs/lab/odometry.md, "Loop closures"]
+_LOOP_QUANTILE = 0.99
+# Iterations of the optimiser for the smoothed path, and its tolerance of the relative error.
+# [measured: tolerances change no path by 0.1 mm, docs/lab/odometry.md, "As a process"]
+_SMOOTHING_ITERATIONS = 10
+_ERROR_TOLERANCE = 1e-4
+
+# Columns of the derivatives of a pair, by the keys of the two bodies.
+_OF_BODIES = tuple(COLUMNS[key] for key in ('X1', 'V1', 'X2', 'V2'))
+# Columns of the derivatives of an IMU factor, by its keys.
+_IMU = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'B1': 6, 'B2': 6})
+_OF_FIRST = np.r_[_IMU['X1'], _IMU['V1'], _IMU['B1']]
+_OF_SECOND = np.r_[_IMU['X2'], _IMU['V2'], _IMU['B2']]
+# Columns of the covariance of a keyframe; the vector of `doubts` follows.
+_KEYFRAME = slices({'pose': 6, 'velocity': 3, 'accel_bias': 3, 'gyro_bias': 3, 'arm': 3})
+POSE = _KEYFRAME['pose']
+VELOCITY = _KEYFRAME['velocity']
+GYRO_BIAS = _KEYFRAME['gyro_bias']
+ARM = _KEYFRAME['arm']
+BIAS = slice(_KEYFRAME['accel_bias'].start, GYRO_BIAS.stop)
+DOUBTS = slice(ARM.start, None)
+# Unknowns of a keyframe without `doubts`.
+_OWN = ARM.start
 
 
 class GraphError(RsRelposeError):
@@ -67,17 +104,22 @@ class GraphError(RsRelposeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeState:
-    """The body at a keyframe, and the camera on it."""
+    """The body at a keyframe, and what is unknown about its camera."""
 
     R: Array
     position: Array
     velocity: Array
     gyro_bias: Array
     accel_bias: Array
-    arm: Array  # (3,) position of the camera in the body [m]
-    # (18, 18) of rotation and translation in the axes of the body, velocity in the world, biases
-    # of accelerometer and gyro, arm.
+    doubts: Array  # (3 + k,) of `doubts.Doubts`
+    # (18 + k, 18 + k) of rotation and translation in the axes of the body, velocity in the world,
+    # biases of accelerometer and gyro, doubts.
     covariance: Array
+
+    @property
+    def arm(self) -> Array:
+        """Position (3,) of the camera in the body [m]."""
+        return self.doubts[doubts.ARM]
 
 
 class Loop(NamedTuple):
@@ -85,7 +127,7 @@ class Loop(NamedTuple):
 
     first: int  # their numbers since the start
     second: int
-    pair: KeyframePair
+    pair: PublishedPair
 
 
 def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
@@ -99,14 +141,20 @@ def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
     return params
 
 
-def _optimizer(iterations: int = 10) -> Any:
+def _optimizer(iterations: int) -> Any:
     """Parameters of gtsam's Levenberg-Marquardt optimiser."""
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(iterations)
-    params.setRelativeErrorTol(1e-4)
+    params.setRelativeErrorTol(_ERROR_TOLERANCE)
     # Sigmas range from 1e-5 (bias walks) to metres: too ill-conditioned for Cholesky.
     params.setLinearSolverType('MULTIFRONTAL_QR')
     return params
+
+
+def _optimized(factors: Any, values: Any) -> Any:
+    """The values that fit all factors."""
+    params = _optimizer(_SMOOTHING_ITERATIONS)
+    return gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
 
 
 class _Innovation(NamedTuple):
@@ -120,7 +168,8 @@ class _Innovation(NamedTuple):
     def chi_squared(self) -> float:
         """Per degree of freedom."""
         n = len(self.errors)
-        return float(self.errors @ np.linalg.solve(np.eye(n) + self.covariance, self.errors)) / n
+        whitened = np.linalg.solve(np.eye(n) + self.covariance, self.errors)
+        return float(self.errors @ whitened) / n
 
 
 class _Noise:
@@ -132,17 +181,15 @@ class _Noise:
 
     def observe(self, innovation: _Innovation, seconds: float) -> None:
         """Use an innovation; `seconds`: since the one before."""
-        known, vectors = np.linalg.eigh(
-            innovation.covariance
-            + (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None] * innovation.by_accelerometer
-        )
-        squared = (innovation.errors @ vectors)[:, None] ** 2
+        more = (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None]
+        covariances = innovation.covariance + more * innovation.by_accelerometer
+        known, vectors = np.linalg.eigh(covariances)
+        squares = (innovation.errors @ vectors)[:, None] ** 2
         variances = np.maximum(known, 0.0)[:, None] + _PAIR_VARIANCES[:, None]
-        log = -0.5 * (squared / variances + np.log(variances)).sum(axis=2)
+        log = -0.5 * (squares / variances + np.log(variances)).sum(axis=2)
         kept = math.exp(-seconds / _FORGOTTEN)
-        self._log = (
-            kept * self._log + (1.0 - kept) * _LIKELY + np.maximum(log - log.max(), -_ONE_PAIR)
-        )
+        remembered = kept * self._log + (1.0 - kept) * _LIKELY
+        self._log = remembered + np.maximum(log - log.max(), -_ONE_PAIR)
         self._read()
 
     def _read(self) -> None:
@@ -159,21 +206,17 @@ class KeyframeGraph:
     """
 
     def __init__(
-        self,
-        start: KeyframeState,
-        R_cam_body: Array,
-        imu: ImuConfig,
-        config: OdometryConfig,
-        *,
-        keep: bool = False,
+        self, start: KeyframeState, unknown: Doubts, parameters: Parameters, *, keep: bool = False
     ) -> None:
-        self._R_cam_body, self._config = R_cam_body, config
-        self._preintegration, self._imu = _preintegration(imu, config), imu
+        self._doubts, self._imu, self._config = unknown, parameters.imu, parameters.odometry
+        self._R_cam_body = parameters.sensor.R_cam_imu
+        self._preintegration = _preintegration(self._imu, self._config)
         self._noise = _Noise()
         # Samples since the newest keyframe, and their integral.
         self._integrated: tuple[ImuInterval | None, Any] = None, None
         # Each update is one step of the optimisation, which the next keyframe continues.
-        self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, _optimizer(1))
+        lag = self._config.smoothing_lag
+        self._smoother = gtsam.BatchFixedLagSmoother(lag, _optimizer(1))
         # All factors and states since the start, for the final smoothing.
         self._record = (gtsam.NonlinearFactorGraph(), gtsam.Values()) if keep else None
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -182,13 +225,15 @@ class KeyframeGraph:
         values.insert(X(0), pose)
         values.insert(V(0), start.velocity)
         values.insert(B(0), bias)
-        values.insert(L(0), start.arm)
-        factors.addPriorPose3(X(0), pose, _gaussian(start.covariance[POSE, POSE]))
-        factors.addPriorVector(
-            V(0), start.velocity, _gaussian(start.covariance[VELOCITY, VELOCITY])
-        )
-        factors.addPriorConstantBias(B(0), bias, _gaussian(start.covariance[BIAS, BIAS]))
-        factors.addPriorVector(L(0), start.arm, _gaussian(start.covariance[ARM, ARM]))
+        values.insert(L(0), start.doubts)
+
+        def of(part: slice) -> Any:
+            return _gaussian(start.covariance[part, part])
+
+        factors.addPriorPose3(X(0), pose, of(POSE))
+        factors.addPriorVector(V(0), start.velocity, of(VELOCITY))
+        factors.addPriorConstantBias(B(0), bias, of(BIAS))
+        factors.addPriorVector(L(0), start.doubts, of(DOUBTS))
         self._update(factors, values, 0, 0.0)
 
     def propagated(self, interval: ImuInterval) -> KeyframeState:
@@ -206,7 +251,7 @@ class KeyframeGraph:
     def add(
         self,
         interval: ImuInterval,
-        pair: KeyframePair | None,
+        pair: PublishedPair | None,
         at_rest: bool,
         *,
         inflation: float = 1.0,
@@ -221,7 +266,6 @@ class KeyframeGraph:
         """
         i, j = self._count - 1, self._count
         pim = self._predicted(interval)
-        rates = interval.rates[[0, -1]] - self._bias.gyroscope()
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(X(j), self._ahead.atPose3(X(j)))
         values.insert(V(j), self._ahead.atVector(V(j)))
@@ -229,43 +273,49 @@ class KeyframeGraph:
         factors.add(_imu_factor(i, j, pim))
         innovation = 0.0
         if pair is not None and pair.images is not None:
-            found = self._innovation(pim, self._pair_factor(i, j, pair, rates))
+            motions = self._motions(interval)
+            found = self._innovation(pim, self._pair_factor(i, j, pair, motions))
             innovation = found.chi_squared
             if innovation <= gate:
-                variance = self._noise.pair_variance
-                # Without a gate, at a start, the misfit shows what is wrong. Later the variance
-                # is no smaller than that of the images: innovations hide errors that persist.
-                if gate < math.inf:
-                    variance = max(variance, 1.0) * max(innovation, 1.0)
-                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation * variance)))
+                variance = inflation * self._variance(innovation, gate)
+                factors.add(self._pair_factor(i, j, pair, motions, math.sqrt(variance)))
                 self._noise.observe(found, interval.duration)
                 if pair.is_pure_rotation:
                     factors.add(self._still_factor(i, j))
         if at_rest and innovation <= gate:
+            at_zero = _diagonal([_REST_VELOCITY_SIGMA] * 3)
             for key in (V(i), V(j)):
-                factors.addPriorVector(key, np.zeros(3), _diagonal([_REST_VELOCITY_SIGMA] * 3))
+                factors.addPriorVector(key, np.zeros(3), at_zero)
         # States before a long bridge stay: the first pairs after it correct them, too.
-        self._update(
-            factors,
-            values,
-            j,
-            self._seconds + min(interval.duration, _LONGEST_STEP * self._config.smoothing_lag),
-            _START_STEPS if pair is not None and gate == math.inf else 1,
-        )
+        step = min(interval.duration, _LONGEST_STEP * self._config.smoothing_lag)
+        steps = _START_STEPS if pair is not None and gate == math.inf else 1
+        self._update(factors, values, j, self._seconds + step, steps)
         return innovation
+
+    def _variance(self, innovation: float, gate: float) -> float:
+        """Variance of a pair by that of its images.
+
+        Without a gate, at a start, the misfit shows what is wrong. Later the variance is no
+        smaller than that of the images: innovations hide errors that persist.
+        """
+        variance = self._noise.pair_variance
+        if gate < math.inf:
+            variance = max(variance, 1.0) * max(innovation, 1.0)
+        return variance
 
     def scale_sigma(self) -> float:
         """1 sigma of the newest velocity, along its least certain direction, by its length."""
-        sigma = math.sqrt(np.linalg.norm(self.newest.covariance[VELOCITY, VELOCITY], 2))
-        return sigma / max(float(np.linalg.norm(self.newest.velocity)), _LEAST_SPEED)
+        variance = np.linalg.norm(self.newest.covariance[VELOCITY, VELOCITY], 2)
+        speed = float(np.linalg.norm(self.newest.velocity))
+        return math.sqrt(variance) / max(speed, _LEAST_SPEED)
 
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""
-        graph: Any = self._smoother.getFactors()  # removed ones are None
-        equations = sum(
-            factor.dim() for k in range(graph.size()) if (factor := graph.at(k)) is not None
-        )
-        return 2.0 * graph.error(self._values) / max(equations - self._values.dim(), 1)
+        graph: Any = self._smoother.getFactors()
+        factors = [graph.at(k) for k in range(graph.size())]
+        equations = sum(factor.dim() for factor in factors if factor is not None)
+        freedom = max(equations - self._values.dim(), 1)
+        return 2.0 * graph.error(self._values) / freedom
 
     def smoothed(self) -> list[KeyframeState]:
         """All keyframes since the start, given all measurements; needs `keep`."""
@@ -284,9 +334,8 @@ class KeyframeGraph:
             misfits = [self._misfit(loop, values, marginals) for loop in loops]
             bound = 1.0
             while True:
-                loops = [
-                    loop for loop, misfit in zip(loops, misfits, strict=True) if misfit <= bound
-                ]
+                judgements = zip(loops, misfits, strict=True)
+                loops = [loop for loop, misfit in judgements if misfit <= bound]
                 graph, values = self._closed(loops, values)
                 misfits = [self._misfit(loop, values) for loop in loops]
                 worst = max(misfits, default=0.0)
@@ -305,7 +354,7 @@ class KeyframeGraph:
         graph = gtsam.NonlinearFactorGraph(self._record[0])
         for loop in loops:
             graph.add(self._pair_factor(*loop, robust=True))
-        return graph, gtsam.LevenbergMarquardtOptimizer(graph, values, _optimizer()).optimize()
+        return graph, _optimized(graph, values)
 
     def _misfit(self, loop: Loop, values: Any, marginals: Any = None) -> float:
         """Chi squared of a loop by its bound; `marginals`: of a path without it."""
@@ -314,34 +363,28 @@ class KeyframeGraph:
         S = np.eye(len(e))
         if marginals is not None:
             # About the predicted pose: the tangents of other directions have steeper derivatives.
-            A, _ = (
-                self._pair_factor(*self._predicted_loop(loop, values)).linearize(values).jacobian()
-            )
+            predicted = self._pair_factor(*self._predicted_loop(loop, values))
+            A, _ = predicted.linearize(values).jacobian()
             S += A @ _joint(marginals, list(factor.keys())) @ A.T
         return float(e @ np.linalg.solve(S, e)) / _loop_bound(len(e)) ** 2
 
     def _predicted_loop(self, loop: Loop, values: Any) -> Loop:
         """The same of the poses of a path."""
-        images, C, c = loop.pair.images, self._R_cam_body, values.atVector(L(0))
+        images = loop.pair.images
         assert images is not None
+        d = values.atVector(L(0))
+        C, arm = self._doubts.R_cam_body(d), d[doubts.ARM]
         way = values.atPose3(X(loop.first)).between(values.atPose3(X(loop.second)))
-        R, q = way.rotation().matrix(), way.transformFrom(c) - c
-        return loop._replace(
-            pair=replace(
-                loop.pair,
-                images=replace(
-                    images,
-                    R=C @ R @ C.T,
-                    t=C @ q / np.linalg.norm(q) if loop.pair.has_direction else images.t,
-                ),
-            )
-        )
+        moved = C @ (way.transformFrom(arm) - arm)
+        direction = moved / np.linalg.norm(moved) if loop.pair.has_direction else images.t
+        predicted = replace(images, R=C @ way.rotation().matrix() @ C.T, t=direction)
+        return loop._replace(pair=replace(loop.pair, images=predicted))
 
     def _smoothed(self) -> tuple[Any, Any]:
         """Values and marginals of the whole record."""
         assert self._record is not None
         factors, values = self._record
-        values = gtsam.LevenbergMarquardtOptimizer(factors, values, _optimizer()).optimize()
+        values = _optimized(factors, values)
         return values, gtsam.Marginals(factors, values)
 
     def _predicted(self, interval: ImuInterval) -> Any:
@@ -349,23 +392,18 @@ class KeyframeGraph:
 
         By the mean of two samples each; those of the prediction before are not repeated.
         """
-        (known, pim), n = self._integrated, 1
-        if known and all(
-            np.array_equal(old, new[: len(old)]) for old, new in zip(known, interval, strict=True)
-        ):
-            n = len(known.seconds)
+        (known, pim), first = self._integrated, 0
+        if known and _continues(interval, known):
+            first = len(known.seconds) - 1
         else:
-            self._preintegration.setAccelerometerCovariance(
-                (self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3)
-            )
+            variance = self._imu.accel_noise_density**2 + self._noise.accel_errors**2
+            self._preintegration.setAccelerometerCovariance(variance * np.eye(3))
             pim = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
-        seconds, rates, forces = (samples[n - 1 :] for samples in interval)
-        for force, rate, step in zip(
-            0.5 * (forces[1:] + forces[:-1]),
-            0.5 * (rates[1:] + rates[:-1]),
-            np.diff(seconds),
-            strict=True,
-        ):
+        forces, rates = interval.forces[first:], interval.rates[first:]
+        steps = np.diff(interval.seconds[first:])
+        mean_forces = 0.5 * (forces[1:] + forces[:-1])
+        mean_rates = 0.5 * (rates[1:] + rates[:-1])
+        for force, rate, step in zip(mean_forces, mean_rates, steps, strict=True):
             pim.integrateMeasurement(force, rate, step)
         self._integrated = interval, pim
         state = pim.predict(self._nav_state, self._bias)
@@ -376,118 +414,123 @@ class KeyframeGraph:
     def _linearised(self, pim: Any) -> tuple[Array, Array]:
         """How errors of the newest keyframe propagate, and the covariance of the samples.
 
-        Both (18, 18), as the covariance of a keyframe.
+        Both are of the size of the covariance of a keyframe.
         """
         factor = _imu_factor(self._count - 1, self._count, pim)
-        # A_i d_i + A_j d_j is white noise, the keys being X_i, V_i, X_j, V_j, B_i, B_j.
+        # A_i d_i + A_j d_j is white noise.
         A, _ = factor.linearize(self._ahead).jacobian()
         back = np.linalg.inv(A[:, _OF_SECOND])
-        by, noise = np.eye(18), np.zeros((18, 18))
-        by[:15, :15] = -back @ A[:, _OF_FIRST]
-        noise[:15, :15] = back @ back.T
+        size = len(self.newest.covariance)
+        by, noise = np.eye(size), np.zeros((size, size))
+        by[:_OWN, :_OWN] = -back @ A[:, _OF_FIRST]
+        noise[:_OWN, :_OWN] = back @ back.T
         return by, noise
 
     def _innovation(self, pim: Any, of_pair: Any) -> _Innovation:
+        """The errors of a pair factor with their covariance, given all before it."""
         by, noise = self._linearised(pim)
         H, e = of_pair.linearize(self._ahead).jacobian()
-        second = np.zeros((len(e), 18))
-        second[:, :9] = H[:, 9:18]
+        poses = POSE.stop + 3  # pose and velocity
+        second = np.zeros((len(e), len(by)))
+        second[:, :poses] = H[:, poses : 2 * poses]
         whole = second @ by
-        whole[:, :9] += H[:, :9]
-        whole[:, ARM] += H[:, 18:]
+        whole[:, :poses] += H[:, :poses]
+        whole[:, DOUBTS] += H[:, 2 * poses :]
         # White noise of the acceleration in position and velocity of the second body.
-        seconds, R = pim.deltaTij(), self._ahead.atPose3(X(self._count)).rotation().matrix()
+        seconds = pim.deltaTij()
+        R = self._ahead.atPose3(X(self._count)).rotation().matrix()
         of_velocity = second[:, VELOCITY] @ R
         of_both = second[:, 3:6] + (1.5 / seconds) * of_velocity
-        by_accelerometer = (
-            seconds**3 / 3.0 * of_both @ of_both.T + seconds / 4.0 * of_velocity @ of_velocity.T
-        )
-        return _Innovation(
-            e,
-            whole @ self.newest.covariance @ whole.T + second @ noise @ second.T,
-            by_accelerometer,
-        )
+        by_position = seconds**3 / 3.0 * of_both @ of_both.T
+        by_velocity = seconds / 4.0 * of_velocity @ of_velocity.T
+        predicted = whole @ self.newest.covariance @ whole.T + second @ noise @ second.T
+        return _Innovation(e, predicted, by_position + by_velocity)
+
+    def _motions(self, interval: ImuInterval) -> tuple[Array, Array]:
+        """Rates (2, 3) and specific forces (2, 3) of the body at the ends of an interval."""
+        ends = [0, -1]
+        rates = interval.rates[ends] - self._bias.gyroscope()
+        return rates, interval.forces[ends] - self._bias.accelerometer()
 
     def _pair_factor(
         self,
         i: int,
         j: int,
-        pair: KeyframePair,
-        rates: Array | None = None,
+        pair: PublishedPair,
+        motions: tuple[Array, Array] = (np.zeros((2, 3)), np.zeros((2, 3))),
         sigma: float = 1.0,
         *,
         robust: bool = False,
     ) -> Any:
-        images = pair.images
+        """The images of a pair against two bodies; `motions`: their rates and specific forces.
+
+        A loop has no motions: it has no velocities, the only ones that depend on the rates.
+        """
+        images, unknown = pair.images, self._doubts
         assert images is not None
-        C = self._R_cam_body
         root, offset = square_root(images.information, images.gradient)
-        n, R = root.shape[1], images.R
-        # A pure rotation has no other deviations.
-        t, velocities = (
-            (images.t, images.velocities)
-            if pair.has_direction
-            else (np.array([0.0, 0.0, 1.0]), np.zeros(6))
-        )
-        # Only velocities depend on the rates.
-        w1, w2 = np.zeros((2, 3)) if rates is None else rates
+        n = root.shape[1]
+        measured = Measured.of(pair)
+        R_cam_body = self._R_cam_body
+        rates, forces = motions
         noise = _diagonal([sigma] * len(offset))
         if robust:
-            noise = gtsam.noiseModel.Robust.Create(
-                gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset))), noise
-            )
-
-        keys = x1, v1, x2, v2, arm = [X(i), V(i), X(j), V(j), L(0)]
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset)))
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        # The estimate of the images moves with the deviations, too.
+        by_images = np.zeros((n, len(unknown.active)))
+        if images.by_deviation is not None:
+            by_images = images.by_deviation[:, unknown.active]
+        keys = x1, v1, x2, v2, common = [X(i), V(i), X(j), V(j), L(0)]
 
         def error(_: Any, values: Any, jacobians: Any) -> Array:
-            P1, P2 = values.atPose3(x1).matrix(), values.atPose3(x2).matrix()
-            e, by = deviations(
-                P1[:3, :3].copy(),
-                P1[:3, 3],
-                values.atVector(v1),
-                w1,
-                P2[:3, :3].copy(),
-                P2[:3, 3],
-                values.atVector(v2),
-                w2,
-                C,
-                values.atVector(arm),
-                R,
-                t,
-                velocities,
-            )
+            d = values.atVector(common)
+            axes, delay = unknown.mount(d)
+            mount = Mount(R_cam_body, d[doubts.ARM].copy(), axes, delay)
+            first = Body.of(values.atPose3(x1), values.atVector(v1), rates[0], forces[0])
+            second = Body.of(values.atPose3(x2), values.atVector(v2), rates[1], forces[1])
+            e, by = deviations(first, second, mount, measured)
+            e, by = e[:n] - by_images @ d[3:], by[:n]
             if jacobians is not None:
-                whole = (by[:n].T @ root.T).T  # column-major, as gtsam requires
-                for block, columns in enumerate(_BLOCKS):
+                whole = (by.T @ root.T).T  # column-major, as gtsam requires
+                for block, columns in enumerate(_OF_BODIES):
                     jacobians[block] = whole[:, columns]
-            return np.asarray(root @ e[:n] + offset)
+                by_others = by[:, COLUMNS['mount']] @ unknown.by_mount - by_images
+                by_all = np.hstack([whole[:, COLUMNS['arm']], root @ by_others])
+                jacobians[len(_OF_BODIES)] = np.asfortranarray(by_all)
+            return np.asarray(root @ e + offset)
 
         return gtsam.CustomFactor(noise, keys, error)
 
     def _still_factor(self, i: int, j: int) -> Any:
         """The camera keeps its position under any rotation of the body."""
-        sigma = self._config.pure_rotation_motion
+        unknown = len(self._doubts.active)
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            keys = factor.keys()
-            pose1, pose2 = values.atPose3(keys[0]), values.atPose3(keys[1])
+            first, second, common = factor.keys()
+            pose1, pose2 = values.atPose3(first), values.atPose3(second)
             R1, R2 = pose1.rotation().matrix(), pose2.rotation().matrix()
-            arm = values.atVector(keys[2])
+            arm = values.atVector(common)[doubts.ARM]
             if jacobians is not None:
-                jacobians[0] = np.asfortranarray(np.hstack([R1 @ skew(arm), -R1]))
-                jacobians[1] = np.asfortranarray(np.hstack([-R2 @ skew(arm), R2]))
-                jacobians[2] = np.asfortranarray(R2 - R1)
-            return np.asarray(pose2.translation() + R2 @ arm - pose1.translation() - R1 @ arm)
+                across = skew(arm)
+                jacobians[0] = np.asfortranarray(np.hstack([R1 @ across, -R1]))
+                jacobians[1] = np.asfortranarray(np.hstack([-R2 @ across, R2]))
+                by_others = np.zeros((3, unknown))
+                jacobians[2] = np.asfortranarray(np.hstack([R2 - R1, by_others]))
+            moved = pose2.translation() + R2 @ arm - pose1.translation() - R1 @ arm
+            return np.asarray(moved)
 
-        return gtsam.CustomFactor(_diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
+        noise = _diagonal([self._config.pure_rotation_motion] * 3)
+        return gtsam.CustomFactor(noise, [X(i), X(j), L(0)], error)
 
     def _update(
         self, factors: Any, values: Any, newest: int, seconds: float, steps: int = 1
     ) -> None:
         """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
         with _solving():
-            # The camera on the body stays in the window.
-            self._smoother.update(factors, values, dict.fromkeys([*values.keys(), L(0)], seconds))
+            # What all keyframes share stays in the window.
+            times = dict.fromkeys([*values.keys(), L(0)], seconds)
+            self._smoother.update(factors, values, times)
             for _ in range(steps - 1):
                 self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
             self._read(newest)
@@ -497,22 +540,26 @@ class KeyframeGraph:
 
     def _read(self, newest: int) -> None:
         """Read the estimates of the smoother."""
-        self._values = self._smoother.calculateEstimate()
-        self._bias = self._values.atConstantBias(B(newest))
-        self.newest = _state(
-            self._values, gtsam.Marginals(self._smoother.getFactors(), self._values), newest
-        )
-        self._nav_state = gtsam.NavState(
-            self._values.atPose3(X(newest)), self._values.atVector(V(newest))
-        )
+        values = self._values = self._smoother.calculateEstimate()
+        marginals = gtsam.Marginals(self._smoother.getFactors(), values)
+        self._bias = values.atConstantBias(B(newest))
+        self.newest = _state(values, marginals, newest)
+        velocity = values.atVector(V(newest))
+        self._nav_state = gtsam.NavState(values.atPose3(X(newest)), velocity)
         # The window, with a place for the prediction of the next keyframe.
-        self._ahead = gtsam.Values(self._values)
+        self._ahead = gtsam.Values(values)
         self._ahead.insert(X(newest + 1), self._nav_state.pose())
         self._ahead.insert(V(newest + 1), self._nav_state.velocity())
         self._ahead.insert(B(newest + 1), self._bias)
         self._integrated = None, None
         if self._record is not None:
-            self._record[1].insert_or_assign(self._values)
+            self._record[1].insert_or_assign(values)
+
+
+def _continues(interval: ImuInterval, known: ImuInterval) -> bool:
+    """Whether an interval begins with all samples of another one."""
+    pairs = zip(known, interval, strict=True)
+    return all(np.array_equal(old, new[: len(old)]) for old, new in pairs)
 
 
 def _loop_bound(dimension: int) -> float:
@@ -532,15 +579,16 @@ def _solving() -> Iterator[None]:
 
 
 def _state(values: Any, marginals: Any, k: int) -> KeyframeState:
+    """A keyframe with its covariance."""
     pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
     return KeyframeState(
-        pose.rotation().matrix(),
-        pose.translation(),
-        values.atVector(V(k)),
-        bias.gyroscope(),
-        bias.accelerometer(),
-        values.atVector(L(0)),
-        _joint(marginals, [X(k), V(k), B(k), L(0)]),
+        R=pose.rotation().matrix(),
+        position=pose.translation(),
+        velocity=values.atVector(V(k)),
+        gyro_bias=bias.gyroscope(),
+        accel_bias=bias.accelerometer(),
+        doubts=values.atVector(L(0)),
+        covariance=_joint(marginals, [X(k), V(k), B(k), L(0)]),
     )
 
 

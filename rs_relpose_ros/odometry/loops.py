@@ -9,9 +9,9 @@ import numpy as np
 
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
-from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import Base, Odometry
 from rs_relpose_ros.pipeline.chosen_pairs import Stamps
 from rs_relpose_ros.pipeline.pair import PairResult
@@ -115,7 +115,7 @@ def close_loops(
     views: Views,
     sensor: Sensor,
     relate: Callable[[list[Stamps]], Sequence[PairResult]],
-) -> tuple[Paths, dict[str, Any], list[KeyframePair]]:
+) -> tuple[Paths, dict[str, Any], list[PublishedPair]]:
     """Add loops to smoothed paths; `relate`: results of pairs of image stamps.
 
     Returns the paths with loops, the report for summary.json, and the loops that count.
@@ -128,7 +128,7 @@ def close_loops(
     depth = scene_depth(path, views, sensor.camera.fx)
     offered = proposed_loops(path, depth, sensor.camera)
     related = relate([(stamps[i], stamps[j]) for i, j in offered]) if offered else []
-    pairs = [KeyframePair.of_result(result) for result in related]
+    pairs = [PublishedPair.of_result(result) for result in related]
     informative = [pair for pair in pairs if pair.images is not None]
     taken = estimator.close_loops(informative)
     paths = estimator.smoothed_paths() if taken else paths

@@ -20,11 +20,12 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.messages.outgoing import quat_xyzw
+from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.loops import close_loops, Paths, Views
 from rs_relpose_ros.odometry.map_points import KeyframeObservations, TRACKS_FILE
-from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.pair import row_ns
 from rs_relpose_ros.odometry.rows import (
     camera_poses,
     Knot,
@@ -100,18 +101,18 @@ def odometry_into(
     observed: list[KeyframeObservations] = []
     views: dict[int, tuple[int, float]] = {}
 
-    def pairs() -> Iterator[tuple[int, KeyframePair]]:
+    def pairs() -> Iterator[tuple[int, PublishedPair]]:
         for pair in replay.pairs():
             observed.append(KeyframeObservations.of_pair(pair))
-            given = KeyframePair.of_result(pair)
-            views[given.current_ns + given.row_ns] = pair.stamp_ns, pair.parallax
+            given = PublishedPair.of_result(pair)
+            views[given.current_imu_ns + row_ns(given)] = pair.stamp_ns, pair.parallax
             yield replay.last_ns, given
 
     samples = _samples(bag, topics)
     states = PublishedStates(estimator, parameters.odometry.odometry_rate)
     live = follow(estimator, pairs(), samples, states.after)
     paths = estimator.smoothed_paths()
-    closed, taken = None, list[KeyframePair]()
+    closed, taken = None, list[PublishedPair]()
     if loops and paths:
         paths, closed, taken = _with_loops(estimator, paths, views, replay, bag, topics)
     smoothed = [keyframe for path in paths for _, keyframe in path]
@@ -153,7 +154,7 @@ def _with_loops(
     replay: Replay,
     bag: Bag,
     topics: SensorTopics,
-) -> tuple[Paths, dict[str, Any], list[KeyframePair]]:
+) -> tuple[Paths, dict[str, Any], list[PublishedPair]]:
     """Smoothed paths with loop closures, their report, and the loops that count."""
     parameters = replay.parameters
     assert replay.intake.intrinsics is not None
@@ -191,6 +192,10 @@ def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str
         **intervals,
         'imu_position': arm.tolist(),
         'imu_position_sigma': arm_sigma.tolist(),
+        'deviations': {
+            name: {'value': value, 'sigma': sigma}
+            for name, (value, sigma) in estimator.deviations.items()
+        },
         'starts': [asdict(started) for started in estimator.starts],
         'length_m': float(steps.sum()),
     }
@@ -201,7 +206,7 @@ def row_trajectory(
     base: Base,
     parameters: Parameters,
     samples: Iterable[ImuSample],
-    loops: Iterable[KeyframePair] = (),
+    loops: Iterable[PublishedPair] = (),
 ) -> RowTrajectory:
     """Poses at any time, of `OdometryEstimator.smoothed_paths` and the samples of the IMU.
 
@@ -221,7 +226,7 @@ def row_trajectory(
         knots,
         buffer,
         np.array([camera_mount, imu_mount, base_mount]),
-        [(loop.reference_ns, loop.current_ns) for loop in loops],
+        [(loop.reference_imu_ns, loop.current_imu_ns) for loop in loops],
     )
 
 
@@ -266,7 +271,7 @@ class PublishedStates:
 
 def follow(
     estimator: OdometryEstimator,
-    pairs: Iterable[tuple[int, KeyframePair]],
+    pairs: Iterable[tuple[int, PublishedPair]],
     samples: Sequence[tuple[int, ImuSample | int]],
     after: Callable[[int, Sequence[Odometry]], None] = lambda arrives_ns, keyframes: None,
 ) -> list[Odometry]:

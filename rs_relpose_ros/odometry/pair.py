@@ -5,139 +5,82 @@ Free of gtsam, for graphs of other libraries.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-import math
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.covariance import ImageInformation
-from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
+from rs_relpose_ros.geometry.so3 import (
+    exp_so3,
+    log_so3,
+    norm,
+    skew,
+    STANDARD_GRAVITY,
+    tangent_basis,
+)
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
-from rs_relpose_ros.messages.incoming import stamp_ns
-from rs_relpose_ros.messages.published_pair import PairStatus
-from rs_relpose_ros.pipeline.findings import Assessment, Code, Finding, FindingState
-from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.pipeline.findings import Code, Finding, FindingState
 
 # Difference of a velocity from the mean one, in units of it, from which its information does not
-# hold: it is linearised at the estimated velocity.
+# hold: it is linearised at the estimated velocity. A smaller limit drops velocities of turns, a
+# larger one keeps wrong ones. [measured: docs/lab/odometry.md, "Starts", far velocities: two such
+# pairs have a chi squared of 35 and 5 per degree of freedom, the others 0.5 in the median]
 _FAR_VELOCITY = 1.5
-# Interval that no pair reaches [ns].
-_LONGEST_NS = 100_000_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class KeyframePair:
-    """A keyframe pair as a measurement of two camera poses, at the stamped rows."""
-
-    stamp_ns: int  # of the current image, on the clock of the camera
-    reference_ns: int  # of both images, on the IMU clock
-    current_ns: int
-    frame_id: str
-    status: str
-    images: ImageInformation | None  # of the images alone; None without information
-    baseline: float  # [m]; NaN if unknown
-    baseline_log_sigma: float
-    gyro_bias: Array  # (3,) [rad/s] active, IMU frame; NaN if unknown
-    contradiction: Finding | None  # against the calibration: it ends a path
-
-    @classmethod
-    def of_result(cls, pair: PairResult) -> KeyframePair:
-        """From a pair of the front end."""
-        pose = pair.pose
-        bias = np.full(3, math.nan) if pair.gyro_bias is None else pair.gyro_bias
-        return cls(
-            pair.stamp_ns,
-            pair.reference_ns1,
-            pair.reference_ns2,
-            pair.frame_id,
-            pose.status.value,
-            pose.images,
-            pose.baseline,
-            pose.baseline_log_sigma,
-            bias,
-            _contradiction(pair.health),
-        )
-
-    @classmethod
-    def of_message(cls, pairs: Any) -> KeyframePair:
-        """From a message on ``~/pairs``; InputError if it is unusable."""
-        status = PairStatus(pairs)
-        if not 0 < status['current_imu_ns'] - status['reference_imu_ns'] < _LONGEST_NS:
-            raise InputError(
-                'current_imu_ns of ~/pairs must be later than reference_imu_ns, by '
-                'less than 100 s: the pair is not used'
-            )
-        return cls(
-            stamp_ns(pairs.header),
-            status['reference_imu_ns'],
-            status['current_imu_ns'],
-            status.frame_id,
-            status['status'],
-            status.images(),
-            status['baseline_m'],
-            status['baseline_log_sigma'],
-            status['gyro_bias_rad_s'],
-            _contradiction(status.findings()),
-        )
-
-    def later(self, delay_ns: int) -> KeyframePair:
-        """The same for rows that are read `delay_ns` later."""
-        return replace(
-            self,
-            stamp_ns=self.stamp_ns + delay_ns,
-            reference_ns=self.reference_ns + delay_ns,
-            current_ns=self.current_ns + delay_ns,
-        )
-
-    @property
-    def row_ns(self) -> int:
-        """From the stamped to the middle row, at which keyframes are; 0 without information."""
-        return 0 if self.images is None else to_nanoseconds(self.images.row_time)
-
-    def without_far_velocities(self) -> KeyframePair:
-        """The same, without velocities where one of them is far from the mean velocity."""
-        if self.images is None or not self.has_direction:
-            return self
-        ways = self.images.velocities.reshape(2, 3) * seconds_between(
-            self.reference_ns, self.current_ns
-        )
-        far = np.linalg.norm(ways - self.images.t, axis=1).max() > _FAR_VELOCITY
-        return replace(self, images=self.images.without_velocities()) if far else self
-
-    def as_loop(self, inflation: float) -> KeyframePair | None:
-        """The same at the middle rows, for frames far apart in time; None without information.
-
-        Without velocities: they are estimated far from the true ones there, and the information
-        about them does not hold. `inflation`: of the covariance.
-        """
-        if self.images is None:
-            return None
-        images = self.images.without_velocities() if self.has_direction else self.images
-        return replace(self, images=images.enlarged(inflation)).later(self.row_ns)
-
-    @property
-    def is_pure_rotation(self) -> bool:
-        """Whether the images have no translation."""
-        return self.status == Status.PURE_ROTATION.value
-
-    @property
-    def has_direction(self) -> bool:
-        """Whether the images determine the direction of motion."""
-        return self.images is not None and bool(np.isfinite(self.images.t).all())
+def row_ns(pair: PublishedPair) -> int:
+    """From the stamped to the middle row, at which keyframes are; 0 without information."""
+    return 0 if pair.images is None else to_nanoseconds(pair.images.row_time)
 
 
-def _contradiction(health: Assessment) -> Finding | None:
+def later(pair: PublishedPair, delay_ns: int) -> PublishedPair:
+    """The same for rows that are read `delay_ns` later."""
+    return replace(
+        pair,
+        stamp_ns=pair.stamp_ns + delay_ns,
+        reference_imu_ns=pair.reference_imu_ns + delay_ns,
+        current_imu_ns=pair.current_imu_ns + delay_ns,
+    )
+
+
+def without_far_velocities(pair: PublishedPair) -> PublishedPair:
+    """The same, without velocities where one of them is far from the mean velocity."""
+    images = pair.images
+    if images is None or not pair.has_direction:
+        return pair
+    seconds = seconds_between(pair.reference_imu_ns, pair.current_imu_ns)
+    ways = images.velocities.reshape(2, 3) * seconds
+    apart = np.linalg.norm(ways - images.t, axis=1)
+    if apart.max() <= _FAR_VELOCITY:
+        return pair
+    return replace(pair, images=images.without_velocities())
+
+
+def as_loop(pair: PublishedPair, inflation: float) -> PublishedPair | None:
+    """The same at the middle rows, for frames far apart in time; None without information.
+
+    Without velocities: they are estimated far from the true ones there, and the information
+    about them does not hold. `inflation`: of the covariance.
+    """
+    images = pair.images
+    if images is None:
+        return None
+    if pair.has_direction:
+        images = images.without_velocities()
+    return later(replace(pair, images=images.enlarged(inflation)), row_ns(pair))
+
+
+def contradiction(pair: PublishedPair) -> Finding | None:
     """The finding that ends a path: a parameter is wrong, or the accelerometer is contradicted.
 
     Pairs continue without the accelerometer, but a path has no other source of scale.
     """
-    for finding in health.findings:
+    for finding in pair.findings.findings:
         suspect = finding.state is FindingState.SUSPECT
         if finding.state is FindingState.WRONG or (suspect and finding.code is Code.ACCEL_AXES):
             return finding
@@ -151,72 +94,145 @@ def _contradiction(health: Assessment) -> Finding | None:
 #
 #     theta = Log(R_1^T R_2 R^T),  s = B^T u / (t . u),  R_1^T v_k / b - d_k
 #
-# as of `rs_relpose_ros.estimator.covariance`, R, t, d_k being the measured ones.
+# as of `rs_relpose_ros.estimator.covariance`, R, t, d_k being the measured ones. Where the images
+# are `delay` later than the times of the bodies, R_k, p_k and v_k are those then::
+#
+#     R_k Exp(w_k delay),  p_k + v_k delay,  v_k + a_k delay
 
-# Shortest baseline [m] with a direction.
+
+class Body(NamedTuple):
+    """The body at a keyframe; all arrays are contiguous."""
+
+    R: Array  # (3, 3) to the world
+    position: Array  # (3,) [m]
+    velocity: Array  # (3,) [m/s] in the world
+    rate: Array  # (3,) [rad/s] in its own axes
+    acceleration: Array  # (3,) [m/s^2] in the world
+
+    @classmethod
+    def of(cls, pose: Any, velocity: Array, rate: Array, force: Array) -> Body:
+        """From a ``gtsam.Pose3`` and the specific force (3,) in the axes of the body."""
+        matrix = pose.matrix()
+        R = matrix[:3, :3].copy()
+        return cls(R, matrix[:3, 3].copy(), velocity, rate, R @ force + _GRAVITY)
+
+
+class Mount(NamedTuple):
+    """The camera on the body; both arrays are contiguous."""
+
+    R: Array  # (3, 3) C as configured
+    arm: Array  # (3,) c [m]
+    axes: Array  # (3,) rotation of the camera from C, in its axes [rad]
+    delay: float  # of the images after the times of the bodies [s]
+
+
+class Measured(NamedTuple):
+    """The estimate of the images; all arrays are contiguous."""
+
+    R: Array  # (3, 3)
+    t: Array  # (3,)
+    velocities: Array  # (6,)
+
+    @classmethod
+    def of(cls, pair: PublishedPair) -> Measured:
+        """From a pair with information; a rotation alone has no other deviations."""
+        images = pair.images
+        assert images is not None
+        if pair.has_direction:
+            return cls(images.R, images.t, images.velocities)
+        return cls(images.R, np.array([0.0, 0.0, 1.0]), np.zeros(6))
+
+
+_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])
+# Shortest baseline [m] with a direction: against a division by zero.
 _LEAST_BASELINE = 1e-4
+# Least cosine between the measured and the predicted direction for which the tangent is used.
+_LEAST_COSINE = 0.1
+# Columns of the derivatives: small rotation and translation of a body in its own axes, its
+# velocity, position of the camera, and its axes with the delay.
+COLUMNS = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'arm': 3, 'mount': 4})
+_WIDTH = 25
 
 
 @kernel
-def _skew(v: Array) -> Array:
-    """``_skew(a) @ b = a x b``."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+def _moved(body: Body, delay: float) -> Body:
+    """The body after a delay, at its rate and acceleration."""
+    return Body(
+        body.R @ exp_so3(delay * body.rate),
+        body.position + delay * body.velocity,
+        body.velocity + delay * body.acceleration,
+        body.rate,
+        body.acceleration,
+    )
 
 
 @kernel
-def deviations(
-    R1: Array,
-    p1: Array,
-    v1: Array,
-    w1: Array,
-    R2: Array,
-    p2: Array,
-    v2: Array,
-    w2: Array,
-    C: Array,
-    c: Array,
-    R: Array,
-    t: Array,
-    velocities: Array,
-) -> tuple[Array, Array]:
-    """Deviations (11,) of a measured pair (R, t, velocities), and their derivatives (11, 21).
+def _by_earlier(by: Array, own: int, body: Body, later: Body, delay: float) -> None:
+    """Turn derivatives (11, 25) by a body after the delay into those by the body before it.
 
-    Of bodies with ``R_k`` to the world, position [m] and velocity [m/s] there, and rate ``w_k``
-    [rad/s] in their own axes. With respect to small rotations and translations of the first one
-    (in its axes), its velocity, the same of the second one, and c. All arrays are contiguous.
+    `own`: its first column. The derivative by the delay is added to the last column.
     """
-    arm = _skew(c)
-    back = C @ R1.T
-    R12 = back @ R2 @ C.T
+    back = exp_so3(-delay * body.rate)
+    rotation, place = by[:, own : own + 3].copy(), by[:, own + 3 : own + 6].copy()
+    velocity = by[:, own + 6 : own + 9].copy()
+    to_body = np.ascontiguousarray(later.R.T)
+    by[:, own : own + 3] = rotation @ back
+    by[:, own + 3 : own + 6] = place @ back
+    by[:, own + 6 : own + 9] = velocity + delay * (place @ to_body)
+    by[:, 24] += rotation @ body.rate
+    by[:, 24] += place @ (to_body @ body.velocity) + velocity @ body.acceleration
+
+
+@kernel
+def deviations(first: Body, second: Body, mount: Mount, measured: Measured) -> tuple[Array, Array]:
+    """Deviations (11,) of a measured pair from two bodies, and their derivatives (11, 25)."""
+    C, c = exp_so3(mount.axes) @ mount.R, mount.arm
+    body1, body2 = first, second
+    if mount.delay != 0.0:
+        body1, body2 = _moved(first, mount.delay), _moved(second, mount.delay)
+    arm = skew(c)
+    back = C @ body1.R.T
+    R12 = back @ body2.R @ C.T
     R12C = R12 @ C
-    q = back @ (p2 + R2 @ c - p1 - R1 @ c)
+    q = back @ (body2.position + body2.R @ c - body1.position - body1.R @ c)
     b = max(norm(q), _LEAST_BASELINE)
     u = q / b
-    dq = np.zeros((3, 21))
-    dq[:, 0:3], dq[:, 3:6] = _skew(q) @ C + C @ arm, -C
-    dq[:, 9:12], dq[:, 12:15], dq[:, 18:21] = -R12C @ arm, R12C, R12C - C
+    across = skew(q)
+    dq = np.zeros((3, _WIDTH))
+    dq[:, 0:3] = across @ C + C @ arm
+    dq[:, 3:6] = -C
+    dq[:, 9:12] = -R12C @ arm
+    dq[:, 12:15] = R12C
+    dq[:, 18:21] = R12C - C
+    dq[:, 21:24] = -across
     db = u @ dq
-    e, by = np.empty(11), np.zeros((11, 21))
-    e[0:3] = log_so3(R12 @ R.T)
-    by[0:3, 0:3], by[0:3, 9:12] = -C, R12C
-    B, along = tangent_basis(t), t @ u
+    e, by = np.empty(11), np.zeros((11, _WIDTH))
+    e[0:3] = log_so3(R12 @ measured.R.T)
+    by[0:3, 0:3] = -C
+    by[0:3, 9:12] = R12C
+    by[0:3, 21:24] = np.eye(3) - R12
+    B, along = tangent_basis(measured.t), measured.t @ u
     # More than 90 deg from the measured direction the tangent is undefined: the sine instead.
-    along = along if along > 0.1 else 1.0
+    along = along if along > _LEAST_COSINE else 1.0
     du = (dq - np.outer(u, db)) / b
     e[3:5] = B.T @ u / along
-    by[3:5] = (B.T @ du - np.outer(e[3:5], t @ du)) / along
+    by[3:5] = (B.T @ du - np.outer(e[3:5], measured.t @ du)) / along
     for k in range(2):
-        R_k, v_k, w_k = (R1, v1, w1) if k == 0 else (R2, v2, w2)
+        body, to_camera = (body1, C) if k == 0 else (body2, R12C)
         # The lever arm rotates with the body.
-        swing = _skew(w_k) @ c
-        w = back @ (v_k + R_k @ swing)
+        swing = skew(body.rate) @ c
+        w = back @ (body.velocity + body.R @ swing)
+        turned = skew(w)
         own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
-        e[rows] = w / b - velocities[3 * k : 3 * k + 3]
-        by[rows, 0:3] += _skew(w) @ C
-        by[rows, own : own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
+        e[rows] = w / b - measured.velocities[3 * k : 3 * k + 3]
+        by[rows, 0:3] += turned @ C
+        by[rows, own : own + 3] -= to_camera @ skew(swing)
         by[rows, own + 6 : own + 9] = back
-        by[rows, 18:21] = (C if k == 0 else R12C) @ _skew(w_k)
+        by[rows, 18:21] = to_camera @ skew(body.rate)
+        by[rows, 21:24] = -turned
         by[rows] = (by[rows] - np.outer(w / b, db)) / b
+    _by_earlier(by, 0, first, body1, mount.delay)
+    _by_earlier(by, 9, second, body2, mount.delay)
     return e, by
 
 
@@ -226,13 +242,22 @@ def square_root(information: Array, gradient: Array) -> tuple[Array, Array]:
     Directions that H does not observe are left out.
     """
     values, vectors = np.linalg.eigh(information)
-    observed = values > 1e-10 * max(values[-1], 1e-300)
-    roots = np.sqrt(values[observed])
-    return roots[:, None] * vectors[:, observed].T, (vectors[:, observed].T @ gradient) / roots
+    observed = values > _OBSERVED * max(values[-1], _TINY)
+    roots, axes = np.sqrt(values[observed]), vectors[:, observed].T
+    return roots[:, None] * axes, (axes @ gradient) / roots
+
+
+# Least eigenvalue of a direction that an information observes, relative to the largest one: below
+# it are rounding errors. [chosen: 1e-12 to 1e-8 would do]
+_OBSERVED = 1e-10
+# Against a division by zero.
+_TINY = 1e-300
 
 
 def warm_up_odometry() -> None:
     """Compile (or load from the cache) the kernels of odometry: a made-up pair, an IMU at rest."""
     eye, z = np.eye(3), np.array([0.0, 0.0, 1.0])
-    deviations(eye, 0.0 * z, z, z, eye, z, z, z, eye, z, eye, z, np.zeros(6))
-    ImuInterval(np.arange(2.0), np.zeros((2, 3)), np.ones((2, 3))).mean_force(np.zeros(3))
+    bodies = [Body(eye, shift * z, z, z, z) for shift in (0.0, 1.0)]
+    deviations(*bodies, Mount(eye, z, z, 0.0), Measured(eye, z, np.zeros(6)))
+    still = ImuInterval(np.arange(2.0), np.zeros((2, 3)), np.ones((2, 3)))
+    still.mean_force(np.zeros(3))

@@ -102,7 +102,8 @@ class ConsistencyMonitor:
             + by_center @ by_center.T
             + (by_deviation @ self._undetermined @ by_deviation.T)
         )
-        widened = replace(pose, covariance=pose.covariance + doubt)
+        images = pose.images and pose.images.moved_by(information.images_by_deviation)
+        widened = replace(pose, covariance=pose.covariance + doubt, images=images)
         # The effect of an inconsistent parameter on the baseline is not known.
         return (
             widened.without_baseline(

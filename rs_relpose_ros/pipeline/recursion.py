@@ -20,7 +20,7 @@ from rs_relpose_ros.core.deviations import LENS, LIVE
 from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator import priors
-from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
+from rs_relpose_ros.estimator.covariance import image_regions, IMAGES, POSE, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, derotate, TwoViewProblem
@@ -91,6 +91,8 @@ class PairInformation:
     # (5, K) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
     images_against_gyro: Array  # (3,) [rad] Log of the rotation by images alone and R_gyro^T
+    # (11, 9) change of the estimate by the images alone, at the middle rows.
+    images_by_deviation: Array
 
 
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
@@ -152,6 +154,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     priors.add_priors(state, prior, H, gradient)
     weighted = J_x.T * weights
     H, gradient, C = H + weighted @ J_x, gradient + weighted @ r, weighted @ J_c
+    images_by_deviation = _images_by_deviation(H, C, information, bool(np.isfinite(pair.t).all()))
     C[THETA : THETA + 3] -= information @ D
     solved = inverse(H) @ np.column_stack([C, gradient])
     if not np.isfinite(solved).all():
@@ -179,7 +182,30 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
         by_deviation[:, LIVE.size :],
         whitened[:, : LIVE.size],
         np.asarray(theta - (inverse(H) @ gradient)[THETA : THETA + 3]),
+        images_by_deviation,
     )
+
+
+def _images_by_deviation(H: Array, C: Array, of_gyro: Array, has_direction: bool) -> Array:
+    """Change of pose and velocities by the images alone (11, 9) with the deviations of IMAGES.
+
+    H (17, 17), C (17, 13): information of the unknowns, and with the deviations, of the matches.
+    The prior of the velocities stays in H: where the images do not observe them, their change
+    would be unbounded. Without a direction only the rotation changes.
+    """
+    H = H.copy()
+    H[THETA : THETA + 3, THETA : THETA + 3] -= of_gyro
+    moved = np.zeros((POSE, C.shape[1]))
+    if has_direction:
+        moved[:] = -(inverse(H) @ C)[:POSE]
+    else:
+        of_theta = slice(THETA, THETA + 3)
+        moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], C[of_theta])
+    by_deviation = np.empty((POSE, IMAGES.size))
+    for name, columns in IMAGES.parts.items():
+        own = slice(LIVE.size, None) if name == 'principal_point' else LIVE.part(name)
+        by_deviation[:, columns] = moved[:, own]
+    return by_deviation
 
 
 def _shifts(
