@@ -34,37 +34,67 @@ from rs_relpose_ros.pipeline.findings import (
 from rs_relpose_ros.pipeline.recursion import Calibration
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
-# Sigmas beyond which a deviation is certain, and those that suffice to linearise about it.
-_CERTAIN, _LIKELY = 4.0, 2.5
-# Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
-_MATTERS, _OUTSIDE = 1.0, 3.0
-# Axes and unit are wrong if a correction leaves less than this share of the images' rotation.
+# Sigmas beyond which a deviation is certain. Fewer would name parameters by chance, as seven are
+# tested after each pair; more would report a wrong parameter later.
+# [chosen: a normal deviate exceeds it once in 16,000; 3.5 to 5 would do]
+_CERTAIN = 4.0
+# Sigmas from which the pairs are linearised about a deviation of the times. Fewer would move the
+# point of linearisation with noise, more would leave a large offset underestimated for longer.
+# [chosen: 2 to 3 would do, below `_CERTAIN`]
+_LIKELY = 2.5
+# Shift of the pose in its own sigmas (Mahalanobis) from which a deviation is suspect. A smaller
+# deviation does no harm that the covariance does not state. [derived: one sigma of the pose]
+_MATTERS = 1.0
+# Shift from which a pose is outside of its covariance, and the deviation wrong.
+# [derived: the 99.7 % quantile of a normal deviate]
+_OUTSIDE = 3.0
+# Share of the images' rotation that a correction of axes and unit leaves at most. More would take
+# independent rotations for turned axes, less would miss them under translation.
+# [chosen: turned axes leave below 0.05 in simulations, independent rotations about 1]
 _EXPLAINED_AT_BEST = 0.5
-# Images over gyro beyond which only another unit is consistent with the scale (deg/s: 0.017).
+# Factor of images over gyro beyond which only another unit is consistent with the scale.
+# [chosen: between a bad scale, 1.1, and deg/s, 57]
 _UNIT_FACTOR = 5.0
-# Rotation of the gyro [rad] after which images must agree, and the share that may remain.
-_LONG_ROTATION, _INDEPENDENT = 2.0, 0.85
-# Rotations within these [rad] of half a turn about an axis of the image, or of a quarter of one
-# about the optical axis, also are flipped images.
-_HALF_TURN, _QUARTER_TURN = 0.6, 0.3
-# Quantile of the pairs' shifts by which a deviation matters: pairs of little motion hide it.
+# Rotation of the gyro [rad] after which images must agree. Less would report a moving object
+# before the camera, more would find the wrong IMU later. [chosen: 1 to 4 would do]
+_LONG_ROTATION = 2.0
+# Share of the rotation that may remain in images of the gyro's own camera.
+# [chosen: independent rotations leave 1 in the mean; 0.75 to 0.95 would do]
+_INDEPENDENT = 0.85
+# Axes that are rotated within these [rad] of half a turn about an axis of the image, or of a
+# quarter of one about the optical axis, may also be flipped images. Wider would offer that for any
+# large rotation, narrower would miss mounts that are not square. [chosen: 35 and 17 deg]
+_HALF_TURN = 0.6
+_QUARTER_TURN = 0.3
+# Quantile of the pairs' shifts by which a deviation matters. The largest would follow a single
+# pair, the median would let pairs of little motion hide a deviation. [chosen: 0.8 to 0.95 would
+# do]
 _OBSERVABLE_IN = 0.9
 # Sigmas within which a parameter that was configured with a sigma is as configured.
+# [derived: the 99.7 % quantile of a normal deviate]
 _AS_CONFIGURED = 3.0
-# Error that linearisation leaves, 1 sigma as a share of the last step: on recordings with times
-# that are far off steps are 0.4 to 0.8 of the error, with other parameters 0.9.
+# Error that linearisation leaves, 1 sigma as a share of the last step. Smaller shares would make
+# the sigma of a suggested value too small. [measured: on recordings with times that are far off,
+# steps are 0.4 to 0.8 of the error, with other parameters 0.9; docs/health.md]
 _REMAINS = np.full(LIVE.size, 0.25)
 _REMAINS[LIVE.mask('time_offset', 'readout_time')] = 1.0
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
-# selected with the wrong value. About 0.08 on recordings.
+# selected with the wrong value. [measured: about 0.08 on recordings]
 _SELECTED = 0.1
-# Gain in chi-square beyond which there is no doubt, and below which a hypothesis fits as well.
-_LARGEST_GAIN, _AS_GOOD = 100.0, 4.0
-# Most inconsistent quantities: traces of a gross error need some, too.
+# Gain in chi-square beyond which there is no doubt; it keeps an exponential finite.
+# [chosen: exp(50) is 5e21; 40 to 1000 would do]
+_LARGEST_GAIN = 100.0
+# Difference in chi-square below which another hypothesis fits as well. More would name two causes
+# where one is plain, less would name the wrong one of two. [derived: two sigmas]
+_AS_GOOD = 4.0
+# Largest number of inconsistent quantities. Traces of a gross error need some, but with more of
+# seven the fit would be free. [chosen: 3 to 5 would do]
 _MOST_QUANTITIES = 4
-# Part of the configured distortion that rectified images have at most.
+# Part of the configured distortion that rectified images have at most. More would take a wrong
+# lens for rectified images. [chosen: 0.1 to 0.4 would do]
 _LITTLE_OF = 0.25
 # Share of the largest shift below which others are traces of a gross error, and not evaluated.
+# Less would name traces, more would hide a second error. [chosen: a third; 0.2 to 0.5 would do]
 _TRACE = 0.34
 
 

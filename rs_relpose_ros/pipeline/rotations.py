@@ -19,18 +19,27 @@ from rs_relpose_ros.imu.buffer import ForceFault
 from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.recursion import LastSeconds, MOST_PAIRS, WINDOW_NS
 
-# Fewer rays give no rotation.
+# Number of rays below which no rotation is estimated. Fewer would follow single wrong matches.
+# [chosen: 8 to 20 would do; a rotation needs two]
 LEAST_RAYS = 12
-# Rotations of the last seconds, at most so many.
+# The comparison uses the rotations of the last seconds. Longer would report an error that was
+# corrected, shorter has too little rotation of a slow camera. [chosen: 4 to 15 s would do]
 _WINDOW_NS = to_nanoseconds(8.0)
+# Largest number of rotations: every third frame and each pair of 8 s at 60 Hz. It bounds the work.
+# [derived: 8 s x 60 Hz / 3]
 _MOST_ROTATIONS = 160
-# Number of rotations, and sum of their angles [rad], that a comparison needs.
-_FEWEST, _LEAST_ANGLE = 5, 0.15
-# Sums of squares of a constant rate, by rounding alone.
+# Number of rotations that a comparison needs, and the sum of their angles [rad]. Less would
+# compare the noise of the matches. [chosen: 4 to 10, and 0.1 to 0.3]
+_FEWEST = 5
+_LEAST_ANGLE = 0.15
+# Sum of squares [rad^2] that a constant rate leaves by rounding alone; it keeps a ratio finite.
+# [derived: squares of double rounding, 1e-32, times the number of rotations]
 _NO_ROTATION = 1e-30
-# Rotation of axes [rad] that the recursive calibration does not reach.
+# Rotation of axes [rad] from which they count as interchanged. Smaller ones the recursive
+# calibration measures. [chosen: its prior is 0.2, interchanged axes are at 1.57 or more]
 _LARGE_ANGLE = 1.0
-# Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
+# Logarithm of a ratio of likelihoods that is certain. Less would report turned axes by chance, as
+# errors of neighbours are alike; more would report them later. [chosen: 10 to 30 would do]
 _LOG_LIKELIHOOD = 20.0
 
 
@@ -147,11 +156,15 @@ def _left(trace: float, theta: Array, phi: Array) -> float:
 
 # -- Accelerometer against images, by the pairs of the last seconds -------------------------------
 
-# Largest weight of a pair: one with misleading matches must not decide alone.
+# Largest logarithm that a pair counts: one with misleading matches must not decide alone. Less
+# would report wrong axes later. [chosen: a third of `_CERTAIN`, so that four pairs have to agree]
 _LARGEST = 3.0
-# Logarithm of a Bayes factor that is certain, errors of neighbours being alike.
+# Logarithm of a Bayes factor that is certain, errors of neighbours being alike. Less would report
+# a right accelerometer. [measured: docs/health.md, "Accelerometer": 6 to 73 with right axes, -87
+# to -5 with wrong ones]
 _CERTAIN = 10.0
-# Time after which samples that are no specific force are reported: a step of a walk is shorter.
+# Time after which samples that are no specific force are reported. Less would report a step of a
+# walk. [chosen: 0.5 to 3 s would do]
 _FAULTY_NS = to_nanoseconds(1.0)
 
 
