@@ -19,7 +19,8 @@ import yaml
 from rs_relpose_ros.bags import files, storage
 from rs_relpose_ros.bags.reader import Bag, open_bag
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.messages.incoming import imu_sample_from_message, intrinsics_from_info
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
+from rs_relpose_ros.messages.incoming import imu_sample_from_message
 
 
 def read_all(path: Path) -> list[object]:

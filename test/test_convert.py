@@ -28,6 +28,7 @@ from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import incoming
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import stamp_ns
 
 IMAGES, INFO = '/camera/image_raw/compressed', '/camera/camera_info'
@@ -58,7 +59,7 @@ class Converted:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        return incoming.intrinsics_from_info(self.of(INFO)[0])
+        return intrinsics_from_info(self.of(INFO)[0])
 
     @property
     def axes(self) -> Rotation:

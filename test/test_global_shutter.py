@@ -29,7 +29,8 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import incoming
-from rs_relpose_ros.messages.incoming import Intake, intrinsics_from_info, Role, stamp_ns
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
+from rs_relpose_ros.messages.incoming import Intake, Role, stamp_ns
 from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.global_shutter import MiddleRow, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame

@@ -1,5 +1,6 @@
 """Messages of rclpy and rosbags to arrays, and results to messages; transforms of a robot."""
 
+import base64
 from dataclasses import replace
 from itertools import pairwise
 import json
@@ -29,7 +30,8 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages import incoming, outgoing, transforms
+from rs_relpose_ros.messages import camera_info, incoming, outgoing, transforms
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import Intake, repeats, Role, StuckGyro
 from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.transforms import FrameTree, Transform, with_extrinsics
@@ -157,6 +159,21 @@ def test_messages_of_16_bits_use_the_given_range(types):
     np.testing.assert_array_equal(decoded(build.compressed(types, png)), first)
 
 
+@pytest.mark.parametrize('noise', [0.0, 10.0])
+@pytest.mark.parametrize('named', ['<', '>'])
+@pytest.mark.parametrize('written', ['<', '>'])
+def test_either_byte_order_of_16_bits_is_read(named, written, noise):
+    """Also where a driver names the wrong one."""
+    smooth = cv2.GaussianBlur(np.random.default_rng(3).normal(0.0, 1.0, (120, 160)), (0, 0), 3.0)
+    shown = 2000.0 + 1500.0 * smooth / np.abs(smooth).max()
+    shown = (shown + noise * np.random.default_rng(4).normal(0.0, 1.0, shown.shape)).astype('u2')
+    message = build.image(
+        build.rosbags_types, 160, 120, 'mono16', shown.astype(f'{written}u2').tobytes(), step=320
+    )
+    message.is_bigendian = int(named == '>')
+    np.testing.assert_array_equal(decoded(message), GrayLevels().gray(shown))
+
+
 @build.both_types
 @pytest.mark.parametrize('bits', [8, 16])
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
@@ -223,9 +240,47 @@ def png_of_size(width: int, height: int) -> bytes:
 JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8))
 
 
+@build.both_types
+@pytest.mark.parametrize(
+    'wrapped',
+    [
+        lambda data: data + bytes(9000),
+        lambda data: data + b'\xff' * 9000,
+        lambda data: data + b'\xd9' * 9000,
+        base64.b64encode,
+    ],
+    ids=['zeros', 'ones', 'bytes of its end', 'base64'],
+)
+def test_files_that_drivers_pad_or_write_as_text(types, wrapped):
+    np.testing.assert_array_equal(
+        decoded(build.compressed(types, wrapped(JPEG))), decoded(build.compressed(types, JPEG))
+    )
+
+
+@build.both_types
+def test_a_png_in_the_format_jpeg(types):
+    gray = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
+    png = cv2.imencode('.png', gray)[1].tobytes()
+    message = build.compressed(types, png)
+    message.format = 'mono8; jpeg compressed mono8'
+    np.testing.assert_array_equal(decoded(message), gray)
+
+
+@build.both_types
+def test_an_image_whose_data_are_a_file(types):
+    """Drivers in MJPEG mode name the encoding that they were asked for."""
+    expected = decoded(build.compressed(types, JPEG))
+    message = build.image(types, 64, 48, 'rgb8', JPEG + bytes(3 * 64 * 48 - len(JPEG)), step=192)
+    np.testing.assert_array_equal(decoded(message), expected)
+    # Pixels that begin as a JPEG does are still pixels.
+    pixels = JPEG[:3] + bytes(3 * 64 * 48 - 3)
+    assert decoded(build.image(types, 64, 48, 'rgb8', pixels, step=192)).shape == (48, 64)
+
+
 @pytest.mark.parametrize(
     ('data', 'expected'),
     [
+        (JPEG[: len(JPEG) // 2] + bytes(9000), 'is truncated'),
         (b'', '0 bytes is neither JPEG nor PNG'),
         (b'GIF89a' + bytes(100), '106 bytes is neither JPEG nor PNG'),
         (JPEG[: len(JPEG) // 2], 'is truncated'),
@@ -261,7 +316,7 @@ def test_unusable_compressed_image_is_refused(data, expected):
     ],
 )
 def test_region_and_binning_shift_rows(types, change, size, corners):
-    calibration = incoming.intrinsics_from_info(build.camera_info(types, **change))
+    calibration = intrinsics_from_info(build.camera_info(types, **change))
     assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
         450.0,
         451.0,
@@ -288,10 +343,78 @@ def test_region_and_binning_shift_rows(types, change, size, corners):
 )
 def test_known_distortion(types, model, count):
     coefficients = tuple(0.001 * (i + 1) for i in range(count))
-    calibration = incoming.intrinsics_from_info(
-        build.camera_info(types, model=model, d=coefficients)
-    )
+    calibration = intrinsics_from_info(build.camera_info(types, model=model, d=coefficients))
     assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
+
+
+FIVE = (-0.3, 0.1, 0.001, 0.002, 0.03)
+
+
+@pytest.mark.parametrize(
+    ('model', 'd', 'expected'),
+    [
+        # Other names of the same models.
+        ('radtan', FIVE[:4], ('plumb_bob', FIVE[:4])),
+        ('Radial-Tangential', FIVE, ('plumb_bob', FIVE)),
+        ('fisheye', FIVE[:4], ('equidistant', FIVE[:4])),
+        ('kannala_brandt4', FIVE[:4], ('equidistant', FIVE[:4])),
+        # No distortion.
+        ('', (), ('plumb_bob', ())),
+        ('none', (), ('plumb_bob', ())),
+        ('pinhole', (0.0,) * 5, ('plumb_bob', ())),
+        # Zeros behind the coefficients, as OpenCV returns them.
+        ('plumb_bob', (*FIVE, *[0.0] * 9), ('plumb_bob', FIVE)),
+        ('plumb_bob', (*FIVE, 0.0), ('plumb_bob', FIVE)),
+        ('equidistant', (*FIVE[:4], 0.0), ('equidistant', FIVE[:4])),
+        ('rational_polynomial', FIVE, ('rational_polynomial', (*FIVE, 0.0, 0.0, 0.0))),
+        (
+            'rational_polynomial',
+            (*FIVE, 0.2, 0.01, 0.02, *[0.0] * 6),
+            ('rational_polynomial', (*FIVE, 0.2, 0.01, 0.02, *[0.0] * 4)),
+        ),
+        (
+            'plumb_bob',
+            (*FIVE, 0.2, 0.01, 0.02, 1e-3, *[0.0] * 5),
+            ('rational_polynomial', (*FIVE, 0.2, 0.01, 0.02, 1e-3, 0.0, 0.0, 0.0)),
+        ),
+    ],
+)
+def test_lenses_as_drivers_name_them(model, d, expected):
+    found = intrinsics_from_info(build.camera_info(build.rosbags_types, model=model, d=d))
+    assert (found.distortion_model, found.distortion) == expected
+
+
+def central(width: int, height: int) -> tuple[float, ...]:
+    return (0.7 * width, 0.0, 0.52 * width, 0.0, 0.7 * width, 0.47 * height, 0.0, 0.0, 1.0)
+
+
+def test_a_binning_that_the_camera_matrix_has_counted_already(caplog):
+    camera_info._warn_once.cache_clear()
+    message = build.camera_info(
+        build.rosbags_types, width=1280, height=960, k=central(640, 480), binning=(2, 2)
+    )
+    intrinsics_from_info(message)
+    assert intrinsics_from_info(message) == intrinsics_from_info(
+        build.camera_info(build.rosbags_types, width=640, height=480, k=central(640, 480))
+    )
+    # One warning, however many messages there are.
+    assert len(caplog.records) == 1
+    assert 'binning of 2x2' in caplog.text and 'image of 640x480' in caplog.text
+    right = build.camera_info(
+        build.rosbags_types, width=1280, height=960, k=central(1280, 960), binning=(2, 2)
+    )
+    assert intrinsics_from_info(right).binning_x == 2
+
+
+def test_a_region_that_the_size_has_counted_already(caplog):
+    camera_info._warn_once.cache_clear()
+    # The principal point is that of the crop.
+    message = build.camera_info(build.rosbags_types, roi=(200, 90, 640, 480))
+    assert intrinsics_from_info(message) == intrinsics_from_info(
+        build.camera_info(build.rosbags_types)
+    )
+    assert 'region of interest at (200, 90)' in caplog.text
+    assert 'clear roi' in caplog.text
 
 
 UNCALIBRATED = {'k': (0.0,) * 9}
@@ -303,6 +426,9 @@ UNCALIBRATED = {'k': (0.0,) * 9}
         (UNCALIBRATED, 'uncalibrated'),
         ({'model': 'double_sphere', 'd': (0.1, 0.2)}, "'double_sphere'"),
         ({'d': (0.1,) * 6}, 'got 6'),
+        ({'model': '', 'd': FIVE}, "model '' and 5 coefficients"),
+        ({'model': 'rational_polynomial', 'd': (0.1,) * 14}, 'tilt the sensor'),
+        ({'model': 'fisheye', 'd': FIVE}, 'got 5'),
         ({'d': (float('nan'),) * 5}, 'distortion must be finite'),
         ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, 'fx must be'),
         ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, 'must be finite'),
@@ -316,7 +442,7 @@ def test_unusable_calibration_is_refused(change, expected):
     # Only a missing one is replaced by the parameters.
     error = MissingInputError if change is UNCALIBRATED else InputError
     with pytest.raises(error, match=expected):
-        incoming.intrinsics_from_info(build.camera_info(build.rosbags_types, **change))
+        intrinsics_from_info(build.camera_info(build.rosbags_types, **change))
 
 
 # -- IMU -------------------------------------------------------------------------------------

@@ -5,7 +5,9 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 `InputError`.
 """
 
+import base64
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from enum import Enum
 from functools import partial
 import math
@@ -14,11 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_relpose_ros.config.settings import Parameters, pinhole_of_matrix
-from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
@@ -51,22 +54,32 @@ def _nanoseconds(seconds: int, nanoseconds: int) -> int:
     return seconds * NANOSECONDS + nanoseconds
 
 
+# First characters of a JPEG and of a PNG file as text in base64, as bridges to web pages send it.
+_BASE64 = (b'/9j/', b'iVBORw0KGgo')
+
+
 def image_from_message(msg: Any) -> images.EncodedImage:
     """Image of a sensor_msgs/Image or CompressedImage; a view, checked when it is decoded."""
     data = np.frombuffer(msg.data, dtype=np.uint8)
     stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
-        return images.CompressedImage(data, str(msg.format), stamp, frame_id)
+        return images.CompressedImage(_binary(data), str(msg.format), stamp, frame_id)
+    encoding = str(msg.encoding)
+    width, height = int(msg.width), int(msg.height)
+    if images.is_encoded(data, (width, height)):
+        # A driver in MJPEG mode publishes what the camera sends, whatever encoding it names.
+        return images.CompressedImage(data, f'{encoding}; a file in an Image', stamp, frame_id)
     return images.RawImage(
-        data,
-        str(msg.encoding),
-        int(msg.width),
-        int(msg.height),
-        int(msg.step),
-        bool(msg.is_bigendian),
-        stamp,
-        frame_id,
+        data, encoding, width, height, int(msg.step), bool(msg.is_bigendian), stamp, frame_id
     )
+
+
+def _binary(data: images.Bytes) -> images.Bytes:
+    """Bytes of a file that may be a text in base64."""
+    if data[: len(_BASE64[1])].tobytes().startswith(_BASE64):
+        with suppress(ValueError):
+            return np.frombuffer(base64.b64decode(data.tobytes()), dtype=np.uint8)
+    return data
 
 
 def pose_from_message(msg: Any) -> TruePose:
@@ -75,41 +88,6 @@ def pose_from_message(msg: Any) -> TruePose:
     return TruePose(
         stamp_ns(msg.header), (position.x, position.y, position.z), (q.x, q.y, q.z, q.w)
     )
-
-
-def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a CameraInfo, region of interest and binning included; MissingInputError."""
-    k = [float(value) for value in info_field(msg, 'k')]
-    if len(k) == 9 and k[0] == 0.0:
-        raise MissingInputError(
-            'the camera is uncalibrated (k[0] of its CameraInfo is 0): calibrate it and let its '
-            'driver publish the result, or give camera_matrix'
-        )
-    pinhole = pinhole_of_matrix('k of CameraInfo', k)
-    width, height = int(msg.width), int(msg.height)
-    images.check_image_size(width, height)
-    # 0 in these fields means "not set": no binning, and the full sensor.
-    binning_x, binning_y = max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)
-    roi = msg.roi
-    roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
-    return Intrinsics(
-        width=width,
-        height=height,
-        **pinhole,
-        distortion_model=str(msg.distortion_model)[:40],
-        distortion=tuple(float(value) for value in info_field(msg, 'd')),
-        x_offset=int(roi.x_offset),
-        y_offset=int(roi.y_offset),
-        binning_x=binning_x,
-        binning_y=binning_y,
-        image_width=roi_width // binning_x,
-        image_height=roi_height // binning_y,
-    )
-
-
-def info_field(msg: Any, name: str) -> Any:
-    """A field of a CameraInfo that has a capital name in ROS 1."""
-    return getattr(msg, name if hasattr(msg, name) else name.upper())
 
 
 def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:

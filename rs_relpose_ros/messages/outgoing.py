@@ -21,7 +21,7 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.incoming import info_field
+from rs_relpose_ros.messages.camera_info import info_field
 from rs_relpose_ros.pipeline import findings_text
 from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult

@@ -77,6 +77,7 @@ def is_dark(image: Image) -> bool:
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 # Start of an image, and of the next marker.
 _JPEG_SIGNATURE = b'\xff\xd8\xff'
+_JPEG_END = b'\xff\xd9'
 # Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC.
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers without a length field: TEM and RST0 to RST7.
@@ -99,9 +100,28 @@ def encoded_image_size(data: Bytes) -> tuple[int, int]:
     if not start.startswith(_JPEG_SIGNATURE):
         raise InputError(f'compressed image of {len(data)} bytes is neither JPEG nor PNG')
     # The decoder would fill missing rows with gray and report no error.
-    if b'\xff\xd9' not in end:
+    if _JPEG_END not in end and not _is_padded(data):
         raise InputError(f'JPEG image of {len(data)} bytes is truncated')
     return _jpeg_size(data)
+
+
+def is_encoded(data: Bytes, size: tuple[int, int]) -> bool:
+    """Whether bytes are a JPEG or PNG of this width and height [px]."""
+    begin = data[: len(_PNG_SIGNATURE)].tobytes()
+    if not begin.startswith((_PNG_SIGNATURE, _JPEG_SIGNATURE)):
+        return False
+    try:
+        return encoded_image_size(data) == size
+    except InputError:
+        return False
+
+
+def _is_padded(data: Bytes) -> bool:
+    """Whether a JPEG is complete, and its file filled with one value up to some size."""
+    content = data.tobytes().rstrip(data[-1:].tobytes())
+    # A byte of the end marker itself may have that value.
+    end = content.rfind(_JPEG_END[:1], len(content) - 2)
+    return end >= 0 and data[end : end + 2].tobytes() == _JPEG_END
 
 
 def _jpeg_size(data: Bytes) -> tuple[int, int]:
@@ -186,6 +206,19 @@ ENCODINGS = (
 )
 
 
+# Pixels of 16 bits are read in the other byte order than that of the message if the roughness of
+# the image is then less than this share. [chosen: in the wrong order any image is as rough as
+# noise, so that 0.3 to 0.8 would do; smaller values miss images of fine texture]
+_OTHER_ORDER = 0.5
+
+
+def _roughness(pixels: NDArray[np.uint16]) -> float:
+    """Mean difference of pixels two columns apart, which have one colour, in sigmas."""
+    rows = pixels[::_STRIDE].astype(np.float32)
+    sigma = float(np.std(rows))
+    return float(np.mean(np.abs(rows[:, 2:] - rows[:, :-2]))) / sigma if sigma > 0.0 else 0.0
+
+
 class Pixels(NamedTuple):
     """An image (H, W) or (H, W, C), and its encoding as in sensor_msgs/Image."""
 
@@ -267,7 +300,12 @@ class RawImage:
     def _two_bytes(self) -> NDArray[np.uint16]:
         """Pixels of 16 bits, in the byte order of the message."""
         order = '>u2' if self.is_bigendian else '<u2'
-        return self._rows(2).view(order)
+        pixels = self._rows(2).view(order)
+        swapped = self._rows(2).view('<u2' if self.is_bigendian else '>u2')
+        # Some drivers name the other order.
+        if self.width > 2 and _roughness(swapped) < _OTHER_ORDER * _roughness(pixels):
+            return swapped
+        return pixels
 
     def _colors(self) -> Bytes:
         channels = _COLOR[self.encoding][0]
