@@ -2,7 +2,7 @@
 
 `FORMATS` has a row for each format that is a folder: its name, the source of `rs_relpose convert`
 that reads it, and the files by which it is recognised. A phone's logger also has a row in
-`phone.READERS`.
+`cli.recordings.PHONES`.
 """
 
 from pathlib import Path
