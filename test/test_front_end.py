@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 import sys
@@ -441,6 +441,93 @@ def test_the_walk_of_one_image_is_short(recorded, parameters):
     assert walk['messages/outgoing.py', 'pair_parts']
     assert sum(walk.values()) <= 12
     assert len(walk) <= 20
+
+
+# Names of the matches of a pair on their way: release 3 had 68, with 13 returns.
+MOST_NAMES = 43
+
+
+def holds(value: Any, count: int, depth: int = 3) -> bool:
+    """Whether a value has something for each of so many matches, alone or in its fields."""
+    if isinstance(value, np.ndarray):
+        return count in value.shape[:2]
+    if depth == 0 or isinstance(value, type):
+        return False
+    if is_dataclass(value):
+        parts = [getattr(value, field.name, None) for field in fields(value)]
+    elif isinstance(value, tuple):
+        parts = list(value)
+    else:
+        return False
+    return any(holds(part, count, depth - 1) for part in parts)
+
+
+def way_of_the_matches(recorded: list[Any], parameters: Parameters) -> tuple[set[str], list[str]]:
+    """Names of the matches of a pair, and the modules that get them, until they are messages.
+
+    Names of arguments, variables and fields, and each change of module, in Python functions of
+    the package but `geometry` and `core`, which are functions of arrays and no stations.
+    """
+    folder = f'{Path(rs_relpose_ros.__file__).parent}/'
+    names: set[str] = set()
+    modules: list[str] = []
+    count = 0
+
+    def profile(frame: Any, event: str, value: Any) -> None:
+        nonlocal count
+        code = frame.f_code
+        module = code.co_filename.removeprefix(folder)
+        if module == code.co_filename or module.startswith(('geometry', 'core')):
+            return
+        if code.co_name == 'refined_matches' and event == 'return':
+            names.clear()
+            modules[:] = [module]
+            count = len(value)
+        elif count and not code.co_name.startswith('<') and event in ('call', 'return'):
+            given = {k: v for k, v in frame.f_locals.items() if k not in ('self', 'cls')}
+            if event == 'call':  # without the variables of an outer function
+                arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+                given = {name: one for name, one in given.items() if name in arguments}
+            holding = {name for name, one in given.items() if holds(one, count)}
+            if event == 'call' and holding and modules[-1] != module:
+                modules.append(module)
+            names.update(holding if event == 'return' else ())
+            names.update(
+                field.name
+                for one in given.values()
+                if is_dataclass(one) and event == 'return'
+                for field in fields(one)
+                if holds(getattr(one, field.name, None), count)
+            )
+
+    front_end = FrontEnd(parameters, offline=True)
+    intake = Intake(front_end.sequencer)
+    for role, message in recorded:
+        intake.receive(role, message)
+        while True:
+            count = 0
+            sys.setprofile(profile)
+            outcome = front_end.step()
+            if isinstance(outcome, Frame) and outcome.result is not None and outcome.result.pose:
+                build.pair_messages(outcome.result, build.rosbags_types)
+                sys.setprofile(None)
+                return names, modules
+            sys.setprofile(None)
+            if outcome is None:
+                break
+    raise AssertionError('no pair with a pose')
+
+
+def test_the_matches_of_a_pair_have_few_names_and_rarely_return(recorded, parameters):
+    """As in docs/architecture.md, "The walk of one image"."""
+    names, modules = way_of_the_matches(recorded, parameters)
+    returns = [module for k, module in enumerate(modules) if module in modules[:k]]
+    print(len(names), *sorted(names))
+    print(len(returns), *modules, sep='\n')
+    assert {'matches', 'problem', 'pose', 'result'} <= names
+    assert modules[0] == 'tracking/klt.py' and modules[-1] == 'messages/outgoing.py'
+    assert len(returns) <= 8
+    assert len(names) <= MOST_NAMES
 
 
 # -- derotated rays and their parallax ------------------------------------------------------------

@@ -484,9 +484,8 @@ def gain_without_gyro(
 
 def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
-    x, y, z = observations[:, :3].T
-    u, v, w = R @ observations[:, 9:12].T
-    normals = np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+    turned = (R @ observations[:, 9:12].T).T
+    normals = np.cross(observations[:, :3], turned).T
     normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
     return np.ascontiguousarray(np.linalg.eigh(normals @ normals.T)[1][:, 0])
 
@@ -510,8 +509,8 @@ def distinct_directions(
     observations: Array, use: NDArray[np.bool_], first: int, cell: float
 ) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
-    x, y = np.round(observations[use, first : first + 2].T / cell)
-    return len(set((x + 1e6 * y).tolist()))
+    cells = np.round(observations[use, first : first + 2] / cell)
+    return len(set((cells @ [1.0, 1e6]).tolist()))
 
 
 def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:

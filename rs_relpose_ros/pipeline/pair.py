@@ -199,15 +199,13 @@ def derotated(
     Points of the reference image do not move: their rays are taken from `known`, derotated
     matches with the same reference, if it has all of the tracks.
     """
-    first = None if known is None else _known_rays(known, matches.track_ids)
-    if first is None:
-        first = sensor.derotated(matches.points1, motion1)
-    second = sensor.derotated(matches.points2, motion2)
-    return replace(
-        matches,
-        rays=np.stack([first[0], second[0]]),
-        row_times=np.stack([first[1], second[1]]),
+    reference = None if known is None else _known_rays(known, matches.track_ids)
+    rays, row_times = zip(
+        reference or sensor.derotated(matches.points1, motion1),
+        sensor.derotated(matches.points2, motion2),
+        strict=True,
     )
+    return replace(matches, rays=np.stack(rays), row_times=np.stack(row_times))
 
 
 def _known_rays(known: Matches, track_ids: Ids) -> tuple[Array, Array] | None:
