@@ -62,7 +62,10 @@ _LARGEST_NOISE = 0.5
 _LEAST_NOISE = 0.1
 
 
-def refined(pose: RelativePose, problem: PairProblem) -> RelativePose:
+def refined(
+    pose: RelativePose,
+    problem: PairProblem,
+) -> RelativePose:
     """The pose from all frames, or the pose of two views with `frames_reason`."""
     if not pose or len(problem.motions) == 2:
         return pose
@@ -115,7 +118,10 @@ def refined(pose: RelativePose, problem: PairProblem) -> RelativePose:
     )
 
 
-def _with_inliers(pose: RelativePose, problem: PairProblem) -> PairProblem:
+def _with_inliers(
+    pose: RelativePose,
+    problem: PairProblem,
+) -> PairProblem:
     """The problem of the inliers alone, in the frames that have enough of them."""
     inliers = np.flatnonzero(pose.inliers)  # new corners are spread in this order
     if len(inliers) > _MOST_TRACKS:
@@ -225,11 +231,20 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
             arm,
             chord,
         )
-        fill_view(tracks, view, frame, inertia)
+        fill_view(
+            tracks,
+            view,
+            frame,
+            inertia,
+        )
     return tracks
 
 
-def _usable(rays: Array, rows: Array, height: int) -> NDArray[np.bool_]:
+def _usable(
+    rays: Array,
+    rows: Array,
+    height: int,
+) -> NDArray[np.bool_]:
     """Which observations (V, N) are used: in the image, of tracks that start in it.
 
     The gyro covers the rows of the image only.
@@ -285,7 +300,10 @@ def _gyro_errors(path: PairProblem) -> tuple[float, Array]:
     return float(of_bias), covariance
 
 
-def _of_carrier(sigma: float, interval: float) -> Array:
+def _of_carrier(
+    sigma: float,
+    interval: float,
+) -> Array:
     """Variances (K,) of the Legendre coefficients of an exponentially correlated acceleration."""
     x, weights = np.polynomial.legendre.leggauss(16)
     count = MOST_ACCELERATIONS
@@ -371,7 +389,11 @@ def _result(
     )
 
 
-def _velocities(state: PathState, path: PairProblem, n: int) -> tuple[Array, Array]:
+def _velocities(
+    state: PathState,
+    path: PairProblem,
+    n: int,
+) -> tuple[Array, Array]:
     """P' at both ends (2, 3), in the axes of camera 1, and its derivatives (2, 3, n)."""
     T = float(path.seconds[-1])
     k = math.exp(state.log_scale)

@@ -175,7 +175,11 @@ class RelativePose:
         """The same with other `diagnostics`."""
         return replace(self, diagnostics=replace(self.diagnostics, **changes))
 
-    def without_translation(self, status: Status, reason: str) -> RelativePose:
+    def without_translation(
+        self,
+        status: Status,
+        reason: str,
+    ) -> RelativePose:
         """The same with the rotation alone, and the reason."""
         covariance = self.covariance.copy()
         velocity_covariance = self.velocity_covariance.copy()
@@ -281,7 +285,14 @@ def landmarks(
     `row_times` (2, N): of the matches, from that of the stamped row [s].
     """
     velocities = np.stack([pose.linear_velocity1, pose.linear_velocity2])
-    rays, points = _equivalent_rays(pose.inliers, rays, row_times, pose.R, pose.t, velocities)
+    rays, points = _equivalent_rays(
+        pose.inliers,
+        rays,
+        row_times,
+        pose.R,
+        pose.t,
+        velocities,
+    )
     return Landmarks(camera.project(rays[0]), camera.project(rays[1]), points)
 
 

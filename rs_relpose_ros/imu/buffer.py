@@ -50,7 +50,11 @@ class Coverage(Enum):
 class Series:
     """Stamped vectors (K, width) in order, in growing arrays; steps above `gap_ns` are gaps."""
 
-    def __init__(self, gap_ns: int, width: int = 3) -> None:
+    def __init__(
+        self,
+        gap_ns: int,
+        width: int = 3,
+    ) -> None:
         self._gap_ns = gap_ns
         self._stamps = np.empty(_ROOM, dtype=np.int64)
         self._values = np.empty((_ROOM, width))
@@ -71,7 +75,11 @@ class Series:
         """The last stamp; None without any."""
         return int(self._stamps[self._end - 1]) if self._end > self._start else None
 
-    def insert(self, stamp_ns: int, value: tuple[float, ...] | None) -> bool:
+    def insert(
+        self,
+        stamp_ns: int,
+        value: tuple[float, ...] | None,
+    ) -> bool:
         """Insert in order; False for no value, and for a stamp that exists already."""
         if value is None:
             return False
@@ -101,7 +109,11 @@ class Series:
         if keep > 0:
             self._start += keep
 
-    def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
+    def between(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> tuple[Stamps, Array] | None:
         """Stamps (K,), values (K, width), borders interpolated; None if not covered."""
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
@@ -125,7 +137,11 @@ class Series:
         fraction = (at_ns - stamps[after - 1]) / step
         return np.asarray(before + fraction * (value - before))
 
-    def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
+    def enclosing(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> Stamps:
         """Stamps within an interval, and one on either side of it."""
         first = max(self.number_until(start_ns) - 1, 0)
         return self.stamps[first : int(self.stamps.searchsorted(end_ns)) + 1]
@@ -134,7 +150,11 @@ class Series:
         """Number of samples up to a time, that time included."""
         return int(self.stamps.searchsorted(at_ns, 'right'))
 
-    def coverage(self, start_ns: int, end_ns: int) -> Coverage:
+    def coverage(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
         stamps = self.stamps
         if len(stamps) == 0:
@@ -292,7 +312,11 @@ class ImuSamples:
         for series in (self.gyro, self.force, self._down):
             series.prune(before_ns)
 
-    def complete(self, start_ns: int, end_ns: int) -> bool:
+    def complete(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> bool:
         """Whether all samples between two times seem to have arrived."""
         until_ns = self.both_until_ns
         if until_ns is None or until_ns < end_ns:
@@ -303,7 +327,11 @@ class ImuSamples:
                 return False
         return True
 
-    def between(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+    def between(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> ImuInterval | None:
         """Samples of both sensors from one time to a later one; None if one has a gap."""
         if (
             end_ns <= start_ns
@@ -320,7 +348,11 @@ class ImuSamples:
             )
         )
 
-    def up_to(self, end_ns: int, seconds: float) -> ImuInterval | None:
+    def up_to(
+        self,
+        end_ns: int,
+        seconds: float,
+    ) -> ImuInterval | None:
         """Samples of both sensors of at most the last `seconds` before a time, if any."""
         if self.both_until_ns is None:
             return None
@@ -384,12 +416,21 @@ class ImuBuffer(ImuSamples):
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
-    def covers(self, start_ns: int, end_ns: int, exposure: float) -> bool:
+    def covers(
+        self,
+        start_ns: int,
+        end_ns: int,
+        exposure: float,
+    ) -> bool:
         """Whether the gyro covers the exposures [s] of all rows between two times."""
         half = to_nanoseconds(0.5 * exposure)
         return self.gyro.coverage(start_ns - half, end_ns + half) is Coverage.AVAILABLE
 
-    def recent_forces(self, until_ns: int, duration_ns: int | None = None) -> Array:
+    def recent_forces(
+        self,
+        until_ns: int,
+        duration_ns: int | None = None,
+    ) -> Array:
         """Specific forces (K, 3) [m/s^2] up to a time, IMU frame."""
         if duration_ns is None:
             # Half of the buffer is there, whenever it is asked for.
@@ -402,7 +443,11 @@ class ImuBuffer(ImuSamples):
         self._run_filters(at_ns)
         return self._bias.estimate(at_ns)
 
-    def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
+    def rotation(
+        self,
+        start_ns: int,
+        end_ns: int,
+    ) -> tuple[Array, Array]:
         """``R_start^T R_end`` (3, 3) in the IMU frame, covariance: see `integrate_rotation`."""
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
         return integration.integrate_rotation(
@@ -508,7 +553,13 @@ def frame_imu(
                 since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
             )
     sigma = None if gravity is None else gravity.sigma
-    imu = FrameImu(motion, sigma, reference_ns, since_previous, no_force)
+    imu = FrameImu(
+        motion,
+        sigma,
+        reference_ns,
+        since_previous,
+        no_force,
+    )
     if no_force or readout is None or gravity is None:
         return imu
     force = _mean_force(motion, readout[0] - reference_ns, readout[1] @ R_cam_imu.T)
@@ -555,7 +606,11 @@ def _slice(
     )
 
 
-def _mean_force(motion: FrameMotion, times_ns: Stamps, forces: Array) -> Array:
+def _mean_force(
+    motion: FrameMotion,
+    times_ns: Stamps,
+    forces: Array,
+) -> Array:
     """Mean (3,) of specific forces (K, 3), in the axes of the stamped row.
 
     `times_ns` (K,): of the forces, from the stamped row on. Forces are linear between samples:

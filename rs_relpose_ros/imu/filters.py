@@ -67,7 +67,10 @@ _SWAY_TIME = 0.1
 _GATE = 4.0
 
 
-def is_at_rest(rates: Array, forces: Array) -> bool:
+def is_at_rest(
+    rates: Array,
+    forces: Array,
+) -> bool:
     """Whether gyro and accelerometer (K, 3) hardly vary; not if too few, or one is NaN."""
     return bool(
         len(rates) >= _LEAST_SAMPLES
@@ -109,7 +112,12 @@ class BiasTracker:
             np.empty((0, 3)),
         )
 
-    def run(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
+    def run(
+        self,
+        stamps_ns: Stamps,
+        rates: Array,
+        forces: Array,
+    ) -> None:
         """Process later samples: stamps (K,), rates [rad/s], forces [m/s^2], or NaN."""
         if not self._follow:
             return
@@ -129,7 +137,12 @@ class BiasTracker:
         """The bias at a time, from the windows up to now."""
         return GyroBias(self._bias, math.sqrt(self._variance_at(at_ns)))
 
-    def _evaluate(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
+    def _evaluate(
+        self,
+        stamps_ns: Stamps,
+        rates: Array,
+        forces: Array,
+    ) -> None:
         """Test one window; `stamps_ns` has one more, that of the sample after it."""
         before = self._rest
         self._rest = None
@@ -241,7 +254,12 @@ class GravityFilter:
         self.stamp_ns: int | None = None
         self._rate = np.zeros(3)
 
-    def run(self, stamps_ns: Stamps, rates: Array, forces: Array) -> None:
+    def run(
+        self,
+        stamps_ns: Stamps,
+        rates: Array,
+        forces: Array,
+    ) -> None:
         """Process samples as `BiasTracker.run`, but with the configured bias removed."""
         k = 0
         while k < len(stamps_ns):
@@ -356,7 +374,10 @@ def _advance(
 
 
 @kernel
-def _direction_variance(length: float, acceleration: float) -> float:
+def _direction_variance(
+    length: float,
+    acceleration: float,
+) -> float:
     """Variance per axis of the direction of a force; excess of its length is as much across."""
     excess = length - STANDARD_GRAVITY
     return (acceleration + 4.0 * excess * excess) / (STANDARD_GRAVITY * STANDARD_GRAVITY)
@@ -455,7 +476,11 @@ def _correct(
 
 
 @small_kernel
-def _gain(H: Array, PHt: Array, variance: float) -> Array:
+def _gain(
+    H: Array,
+    PHt: Array,
+    variance: float,
+) -> Array:
     """``K = P H^T S^-1`` (6, 3) with ``S = H P H^T + variance I``."""
     S = np.zeros((3, 3))
     adjugate = np.empty((3, 3))
@@ -475,7 +500,10 @@ def _gain(H: Array, PHt: Array, variance: float) -> Array:
 
 
 @small_kernel
-def _rotate(R: Array, v: Array) -> None:
+def _rotate(
+    R: Array,
+    v: Array,
+) -> None:
     """``v <- R v`` of a vector (3,)."""
     product = rotated(R, v)
     for i in range(3):
@@ -483,7 +511,11 @@ def _rotate(R: Array, v: Array) -> None:
 
 
 @kernel
-def _add_product(A: Array, B: Array, out: Array) -> None:
+def _add_product(
+    A: Array,
+    B: Array,
+    out: Array,
+) -> None:
     """``out <- out + A B``, term by term in this order; BLAS costs more for small matrices."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -494,7 +526,11 @@ def _add_product(A: Array, B: Array, out: Array) -> None:
 
 
 @kernel
-def _write_product_transposed(A: Array, B: Array, out: Array) -> None:
+def _write_product_transposed(
+    A: Array,
+    B: Array,
+    out: Array,
+) -> None:
     """``out <- A B^T``; `out` is another array than A and B."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -524,7 +560,10 @@ def mean_gravity(forces: Array) -> GravityEstimate | None:
     return GravityEstimate(-mean / length, math.hypot(0.1, excess))
 
 
-def agreed_gravity(own: GravityEstimate, measured: GravityEstimate | None) -> GravityEstimate:
+def agreed_gravity(
+    own: GravityEstimate,
+    measured: GravityEstimate | None,
+) -> GravityEstimate:
     """The IMU's own estimate unless the accelerometer's contradicts (another world frame)."""
     own = replace(own, sigma=max(own.sigma, _LEAST_OWN_SIGMA))
     if measured is None:

@@ -130,7 +130,10 @@ def mean_rates(
 
 
 @kernel
-def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
+def _integrate(
+    seconds: Array,
+    rates: Array,
+) -> tuple[Array, Array, Array]:
     """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
 
     An error dw of the rate of step k rotates the result by ``L_k dw dt`` on the left (in the start
@@ -276,7 +279,11 @@ def preintegrate(
     )
 
 
-def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
+def _by_lever_arm(
+    duration: float,
+    R: Array,
+    rates: Array,
+) -> Array:
     """Derivatives (6, 3) of the camera's (alpha, beta) by the lever arm p.
 
     With the pose (R, b t) of the second frame in the first one::
@@ -289,7 +296,10 @@ def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
     return np.vstack([duration * swing1 + np.eye(3) - R, swing1 - swing2])
 
 
-def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
+def force_integrals(
+    steps: Array,
+    forces: Array,
+) -> tuple[Array, Array]:
     """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
     before = forces[:-1]
     after = forces[1:]

@@ -129,7 +129,10 @@ def _matched(
     return history, matches
 
 
-def _since(first: Frame[Any], frame: Frame[Any]) -> ImuSlice | None:
+def _since(
+    first: Frame[Any],
+    frame: Frame[Any],
+) -> ImuSlice | None:
     """The IMU since the first frame; None if the frame's samples begin at another one."""
     since = frame.imu.since_previous
     if since is None or since.stamps_ns[0] != first.imu.reference_ns:
@@ -196,7 +199,12 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         }
         return pairs or None
 
-    def _pair(self, first_ns: int, second: Frame[Any], parameters: Parameters) -> PairResult | str:
+    def _pair(
+        self,
+        first_ns: int,
+        second: Frame[Any],
+        parameters: Parameters,
+    ) -> PairResult | str:
         """The pair of an earlier frame and the current one, or the reason for none."""
 
         def since_first(frame: Frame[Any]) -> Frame[Any]:

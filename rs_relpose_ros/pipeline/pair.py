@@ -208,7 +208,10 @@ def derotated(
     return replace(matches, rays=np.stack(rays), row_times=np.stack(row_times))
 
 
-def _known_rays(known: Matches, track_ids: Ids) -> tuple[Array, Array] | None:
+def _known_rays(
+    known: Matches,
+    track_ids: Ids,
+) -> tuple[Array, Array] | None:
     """Rays and row times of tracks in the reference image; None unless all are known."""
     rows = positions(known.track_ids, track_ids)
     if len(rows) < len(track_ids):
@@ -217,7 +220,10 @@ def _known_rays(known: Matches, track_ids: Ids) -> tuple[Array, Array] | None:
 
 
 @kernel
-def positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
+def positions(
+    ids: Ids,
+    wanted: Ids,
+) -> NDArray[np.int64]:
     """Positions of `wanted` among the ids, up to the first one that is not there in order."""
     found = np.empty(len(wanted), dtype=np.int64)
     k = 0
@@ -232,7 +238,11 @@ def positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
 
 
 @kernel
-def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
+def median_parallax(
+    rays1: Array,
+    rays2: Array,
+    rotation: Array,
+) -> float:
     """Median of ``|f_1 x R f_2|`` [about rad] of unit rays (N, 3), ``R = R_1^T R_2`` (3, 3).
 
     Rays of NaN do not count; 0 if there are no others.
@@ -247,7 +257,11 @@ def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
     return median(values[:count]) if count else 0.0
 
 
-def parallax_of(matches: Matches, since: ImuSlice | None, sensor: Sensor) -> float:
+def parallax_of(
+    matches: Matches,
+    since: ImuSlice | None,
+    sensor: Sensor,
+) -> float:
     """Median parallax [px] of derotated matches, with the gyro's rotation between the frames."""
     if since is None:
         rotation = aligning_rotation(matches.rays[0].T @ matches.rays[1])
@@ -256,7 +270,10 @@ def parallax_of(matches: Matches, since: ImuSlice | None, sensor: Sensor) -> flo
     return sensor.camera.fx * median_parallax(*matches.rays, rotation)
 
 
-def interval_of(first: FrameImu, second: FrameImu) -> float:
+def interval_of(
+    first: FrameImu,
+    second: FrameImu,
+) -> float:
     """Seconds between the stamped rows of two frames."""
     return seconds_between(first.reference_ns, second.reference_ns)
 
@@ -283,7 +300,11 @@ def used_frames(between: Sequence[Frames]) -> list[Frames]:
 class TrackHistory:
     """The frames since a reference keyframe, and the pair that the last one makes with it."""
 
-    def __init__(self, stamp_ns: int, imu: FrameImu) -> None:
+    def __init__(
+        self,
+        stamp_ns: int,
+        imu: FrameImu,
+    ) -> None:
         """Begin at a reference keyframe, with its stamp and IMU data."""
         self.stamp_ns = stamp_ns
         self.imu = imu
@@ -298,7 +319,12 @@ class TrackHistory:
         """The IMU from the reference to the last frame; None without a frame, or with a gap."""
         return self._frames[-1][1] if self._frames else None
 
-    def add(self, imu: FrameImu, since: ImuSlice | None, matches: Matches) -> None:
+    def add(
+        self,
+        imu: FrameImu,
+        since: ImuSlice | None,
+        matches: Matches,
+    ) -> None:
         """Add the current frame with the samples since the reference and with its tracks."""
         self._frames.append((imu, since, matches))
 
@@ -484,7 +510,10 @@ def _with_gravity(
     return imu1.motion, imu2.motion, sigma
 
 
-def _points(tracked: Matches, matches: Matches) -> Array:
+def _points(
+    tracked: Matches,
+    matches: Matches,
+) -> Array:
     """Second points (N, 2) of `tracked` for the tracks of `matches`; NaN where one was lost."""
     rows = positions(tracked.track_ids, matches.track_ids)
     if len(rows) == len(matches):  # no track was lost meanwhile, or changed its place

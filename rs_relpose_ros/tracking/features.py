@@ -98,7 +98,11 @@ def _strong_corners(
 
 
 @kernel
-def _occupy(free: Image, points: Array, radius: int) -> None:
+def _occupy(
+    free: Image,
+    points: Array,
+    radius: int,
+) -> None:
     """Clear the discs around `points` (M, 2)."""
     height, width = free.shape
     for k in range(points.shape[0]):
@@ -112,13 +116,19 @@ def _occupy(free: Image, points: Array, radius: int) -> None:
                     free[row, column] = 0
 
 
-def feature_rows(config: TrackingConfig, height: int) -> tuple[float, float]:
+def feature_rows(
+    config: TrackingConfig,
+    height: int,
+) -> tuple[float, float]:
     """First and last row of features."""
     first, last = config.feature_rows
     return (first, last) if last > 0.0 else (first, height - 1.0)
 
 
-def within(points: Array, allowed: Image | None) -> Flags:
+def within(
+    points: Array,
+    allowed: Image | None,
+) -> Flags:
     """Mask (N,) of points (N, 2) of an image that lie where `allowed` (H, W) is not zero."""
     if allowed is None:
         return np.ones(len(points), dtype=bool)
@@ -128,7 +138,10 @@ def within(points: Array, allowed: Image | None) -> Flags:
     return np.asarray(inside & (allowed[v.clip(0, height - 1), u.clip(0, width - 1)] > 0))
 
 
-def keep_apart(points: Array, radius: float) -> Flags:
+def keep_apart(
+    points: Array,
+    radius: float,
+) -> Flags:
     """Mask (N,) of points (N, 2) that are not within `radius` of one before them."""
     kept = np.ones(len(points), dtype=bool)
     if len(points) > 1:
@@ -138,7 +151,11 @@ def keep_apart(points: Array, radius: float) -> Flags:
     return kept
 
 
-def _spread(points: Array, taken: Array, cell: float) -> Indices:
+def _spread(
+    points: Array,
+    taken: Array,
+    cell: float,
+) -> Indices:
     """Order of `points` (N, 2), best first, that fills the cells of a grid evenly.
 
     A point ranks behind the better ones of its cell and behind those `taken` (M, 2) in it.
@@ -285,7 +302,11 @@ class DescriptorTracker:
             self._ids.take(len(kept)), points[kept], np.ascontiguousarray(descriptors[kept])
         )
 
-    def _match(self, first: _Keypoints, second: _Keypoints) -> tuple[Indices, Indices, Array]:
+    def _match(
+        self,
+        first: _Keypoints,
+        second: _Keypoints,
+    ) -> tuple[Indices, Indices, Array]:
         """Indices into both and quality: 1 - (best / second best distance)."""
         if len(first.ids) < 2 or len(second.ids) < 2:
             nothing = np.empty(0, dtype=np.int64)

@@ -105,7 +105,10 @@ def encoded_image_size(data: Bytes) -> tuple[int, int]:
     return _jpeg_size(data)
 
 
-def is_encoded(data: Bytes, size: tuple[int, int]) -> bool:
+def is_encoded(
+    data: Bytes,
+    size: tuple[int, int],
+) -> bool:
     """Whether bytes are a JPEG or PNG of this width and height [px]."""
     begin = data[: len(_PNG_SIGNATURE)].tobytes()
     if not begin.startswith((_PNG_SIGNATURE, _JPEG_SIGNATURE)):
@@ -242,7 +245,12 @@ class RawImage:
     is_png: ClassVar[bool] = False
 
     @classmethod
-    def of_gray(cls, image: Image, stamp_ns: int, frame_id: str = '') -> Self:
+    def of_gray(
+        cls,
+        image: Image,
+        stamp_ns: int,
+        frame_id: str = '',
+    ) -> Self:
         """A mono8 image of an array (H, W)."""
         height, width = image.shape
         return cls(
@@ -377,7 +385,10 @@ class CompressedImage:
         return Pixels(image, encoding)
 
 
-def _decoded(data: Bytes, flags: int) -> NDArray[Any]:
+def _decoded(
+    data: Bytes,
+    flags: int,
+) -> NDArray[Any]:
     """Pixels of a JPEG or PNG file; `flags` of cv2.imdecode."""
     width, height = encoded_image_size(data)
     check_image_size(width, height)
@@ -393,7 +404,10 @@ def _decoded(data: Bytes, flags: int) -> NDArray[Any]:
 EncodedImage = RawImage | CompressedImage
 
 
-def check_image_size(width: int, height: int) -> None:
+def check_image_size(
+    width: int,
+    height: int,
+) -> None:
     """Raise InputError for an impossible size."""
     sides = 0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
     if not sides or width * height > MAX_IMAGE_PIXELS:
@@ -403,7 +417,10 @@ def check_image_size(width: int, height: int) -> None:
         )
 
 
-def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
+def checked(
+    image: Image,
+    shape: tuple[int, ...] | None,
+) -> Image:
     """The input of a tracker, as a contiguous (H, W) array of uint8; InputError if it is not.
 
     Read-only, as the memory of a raw image is, so that kernels are compiled for one type only.

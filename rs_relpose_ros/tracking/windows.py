@@ -36,7 +36,11 @@ class Patches:
         self.image.flags.writeable = False  # as images are: see `images.checked`
 
 
-def cut(image: Image, points: Array, radius: int) -> Patches:
+def cut(
+    image: Image,
+    points: Array,
+    radius: int,
+) -> Patches:
     """Patches of ``2 radius + 1`` pixels around points (N, 2), the border repeated."""
     centres, corners, shape = _layout(points, radius)
     # The unused places of the last row are not read, hence not initialised.
@@ -78,7 +82,10 @@ def cut_warped(
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
 
-def _layout(points: Array, radius: int) -> tuple[Integers, Integers, tuple[int, int]]:
+def _layout(
+    points: Array,
+    radius: int,
+) -> tuple[Integers, Integers, tuple[int, int]]:
     """Centre pixels (N, 2) of patches, their upper left corners (N, 2) in one image, its shape."""
     bounded = np.clip(points, -_FARTHEST, _FARTHEST)
     count = len(points)
@@ -154,7 +161,11 @@ def _fill_maps(
 
 
 @kernel
-def _squares(image: Image, points: Array, side: int) -> Image:
+def _squares(
+    image: Image,
+    points: Array,
+    side: int,
+) -> Image:
     """Squares (N, side, side) of pixels from `points` (N, 2), whole numbers, on."""
     first = np.empty(points.shape, np.int64)
     corners = np.zeros(points.shape, np.int64)
@@ -285,7 +296,10 @@ def _sample(
 
 
 @kernel
-def _total(by_column: Floats, side: int) -> float:
+def _total(
+    by_column: Floats,
+    side: int,
+) -> float:
     """Sum of the first `side` columns."""
     total = 0.0
     for j in range(side):
@@ -328,7 +342,10 @@ def brightness_table(
     return np.clip(levels, 0.0, 255.0).astype(np.uint8)
 
 
-def with_brightness(image: Image, table: Image | None) -> Image:
+def with_brightness(
+    image: Image,
+    table: Image | None,
+) -> Image:
     """`image` mapped through a table of `brightness_table`; read-only, as all images."""
     if table is None:
         return image
@@ -338,7 +355,11 @@ def with_brightness(image: Image, table: Image | None) -> Image:
 
 
 @kernel
-def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
+def _statistics(
+    image: Image,
+    points: Array,
+    side: int,
+) -> tuple[Array, Array]:
     """Mean and standard deviation (N,) of windows of whole pixels around `points` (N, 2)."""
     pixels = side * side
     windows = _squares(image, np.rint(points) - side // 2, side)
