@@ -30,9 +30,9 @@ def save_picture(picture: Figure, path: Path) -> None:
 SUMMARY_FILE = 'summary.json'
 # Colours that are distinguishable in every kind of colour vision. [derived: Okabe and Ito]
 BLUE = '#0072B2'
-ORANGE = '#E69F00'
-GREEN = '#009E73'
-RED = '#D55E00'
+ORANGE = '#E69F00'  # likewise
+GREEN = '#009E73'  # likewise
+RED = '#D55E00'  # likewise
 
 
 def refuse_existing(*paths: Path) -> None:

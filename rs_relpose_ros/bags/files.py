@@ -40,6 +40,7 @@ _MAX_METADATA_BYTES = 1 << 24
 # times its own. Without a bound a file of some kilobytes would fill the disk; a smaller one would
 # refuse recordings that compress well. [chosen: images of noise-free simulations reach 100 times]
 MAX_FILE_BYTES = 1 << 30
+# [chosen: see above]
 _MAX_FILE_GROWTH = 200
 # Bytes that are decompressed at once. [chosen: 64 kB to 64 MB]
 _BLOCK = 1 << 20
@@ -55,6 +56,7 @@ class Metadata(NamedTuple):
     parts: dict[str, tuple[float, float, int]]  # start [s], duration [s], messages of a file
 
 
+# What is known of a bag without usable metadata.
 _NOTHING = Metadata((), {}, {})
 
 

@@ -22,14 +22,20 @@ from rs_relpose_ros.bags.storage import (
     StoredTopic,
 )
 
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0B, 0x0F
+# Kinds of records. [derived: the MCAP specification, as the layouts below]
+_SCHEMA = 0x03
+_CHANNEL = 0x04  # a topic
+_MESSAGE = 0x05
+_CHUNK = 0x06
+_STATISTICS = 0x0B
+_DATA_END = 0x0F
 _HEAD = struct.Struct('<BQ')  # of a record: kind and size
 _MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, times of log and of publication
 _CHUNK_HEAD = struct.Struct('<QQQII')  # times, size, checksum, length of the compression's name
 _STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')  # counts; first and last time
 _FOOTER = struct.Struct('<BQQQI8s')  # head, start of the summary, checksum, magic
-_LENGTH = struct.Struct('<I')
-_SIZE = struct.Struct('<Q')
+_LENGTH = struct.Struct('<I')  # of a text
+_SIZE = struct.Struct('<Q')  # of data
 # Bytes of the longest name of a compression that is read with the head of a chunk.
 _MAX_NAME = 64
 

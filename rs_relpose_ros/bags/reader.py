@@ -28,26 +28,40 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Topics and frames of the bags that the project writes.
 COMPRESSED_TOPIC = '/camera/image_raw/compressed'
+# The same, if images are raw.
 RAW_TOPIC = '/camera/image_raw'
+# Topic of the CameraInfo.
 CAMERA_INFO_TOPIC = '/camera/camera_info'
+# Topic of an IMU with one stamp for gyro and accelerometer.
 IMU_TOPIC = '/imu/data_raw'
 # Gyro and accelerometer of phones, which stamp them separately.
 GYRO_TOPIC = '/imu/gyro'
+# Topic of the accelerometer of phones.
 ACCEL_TOPIC = '/imu/accel'
+# Topic of the true poses of the camera.
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 
+# Frame of the images.
 CAMERA_FRAME = 'camera_optical_frame'
+# Frame of the IMU.
 IMU_FRAME = 'imu_link'
+# Frame of the true poses.
 WORLD_FRAME = 'world'
 
 # Delay of a driver between the stamp (of an image: the end of its readout) and delivery [s].
 IMAGE_DELAY = 0.005
+# The same of an IMU sample [s].
 IMU_DELAY = 0.002
 
+# Types of the messages that are read.
 IMAGE = 'sensor_msgs/msg/Image'
+# Type of a compressed image.
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+# Type of the intrinsics.
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+# Type of an IMU sample.
 IMU = 'sensor_msgs/msg/Imu'
+# Type of a true pose.
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
 _logger = logging.getLogger(__name__)
@@ -470,6 +484,7 @@ class Bag:
 _MEASURED = (IMAGE, COMPRESSED_IMAGE, IMU)
 # Bytes before the stamp of a message with a header: kind of the encoding, or in ROS 1 a number.
 _BEFORE_STAMP = 4
+# Stamp of a header: seconds and nanoseconds.
 _STAMP = struct.Struct('<iI')
 
 

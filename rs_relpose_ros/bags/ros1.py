@@ -26,15 +26,24 @@ from rs_relpose_ros.bags.storage import (
 )
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
+# First bytes of a file. [derived: the format of ROS 1 bags, version 2.0]
 _MAGIC = b'#ROSBAG V2.0\n'
-_MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
+# Kinds of records. [derived: the format, as the layouts below]
+_MESSAGE = 2
+_CHUNK = 5
+_CHUNK_INFO = 6
+_CONNECTION = 7  # a topic of one publisher
+# Size of a record.
 _LENGTH = struct.Struct('<I')
+# Place of a record in the file.
 _PLACE = struct.Struct('<Q')
+# Time: seconds and nanoseconds.
 _TIME = struct.Struct('<II')
 _COUNT = struct.Struct('<II')  # connection, number of its messages in a chunk
 # Bytes of the largest header of a record that is read. [chosen: that of a connection holds a
 # topic's name, the others less than 100 bytes]
 _MAX_HEADER = 1 << 16
+# Duration without an end in profiles of QoS. [derived: rosbag2]
 _FOREVER = QosTime(2147483647, 4294967295)
 # QoS in ROS 2 of a topic whose publisher has latched its last message, as `rosbags-convert` has
 # it.

@@ -66,8 +66,8 @@ _JOB_FILE = 'job.json'
 # How the work on a bag ended.
 DONE = 'done'
 FINDINGS = 'findings'  # completed with exit code 1
-REFUSED = 'refused'
-FAILED = 'failed'
+REFUSED = 'refused'  # bad input
+FAILED = 'failed'  # an error of the system, such as a full disk
 LOST = 'lost'  # the workers died
 # All of them, in the order of the summary.
 STATES = (DONE, FINDINGS, REFUSED, FAILED, LOST)

@@ -242,6 +242,7 @@ def _ros(document: Mapping[str, Any]) -> Calibration:
     return Calibration('camera_calibration of ROS', values, size)
 
 
+# Tools: whether a document is theirs, and its reader.
 _TOOLS: tuple[
     tuple[
         Callable[[Mapping[str, Any]], bool],

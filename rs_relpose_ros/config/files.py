@@ -26,6 +26,7 @@ from rs_relpose_ros.output_files import written
 
 _logger = logging.getLogger(__name__)
 
+# Section of a parameter file that is read by default.
 _NODE = 'relpose_node'
 # Parameters of every ROS node, without effect offline.
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
@@ -39,6 +40,7 @@ _SIGMAS = {
 }
 # Largest file that is read [bytes]; a file of all parameters has 10,000.
 _MAX_BYTES = 1 << 20
+# Longest comment line of a generated file [characters]. [chosen: any value in 70..120 would do]
 _COMMENT_WIDTH = 95
 
 
@@ -211,6 +213,7 @@ def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: converted(name, value) for name, value in values.items()}
 
 
+# Head of the generated file.
 _HEAD = """\
 # Parameters of relpose_node, global_shutter_node and `--params` of the commands, each at its
 # default.

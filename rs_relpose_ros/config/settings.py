@@ -106,6 +106,7 @@ class Settings:
             declared(item).check(item.name, value)
 
 
+# Legal values of the parameter solver.
 SOLVER_CHOICES = ('auto', *SOLVERS)
 
 
@@ -117,11 +118,13 @@ class CarrierMotion(NamedTuple):
     acceleration: float
 
 
+# Carriers by the value of the parameter motion.
 MOTIONS = {
     'hand_held': CarrierMotion(0.1, 3.0, 1.5),
     'vehicle': CarrierMotion(0.5, 40.0, 1.5),
     'drone': CarrierMotion(0.2, 15.0, 3.0),
 }
+# Legal values of the parameter refinement.
 REFINEMENTS = ('map', 'alternating', 'none')
 
 
@@ -519,6 +522,7 @@ class CalibrationConfig(Settings):
     )
 
 
+# Calibration from images, whose exposure is not zero.
 TRACKED_IN_IMAGES = CalibrationConfig(exposed=True)
 
 

@@ -14,9 +14,9 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.lens import (
     ByLens,
+    CompiledLens,
     DISTORTION_MODELS,
     DistortionModel,
-    Lens,
     points_by_lens,
     project_points,
     project_rotating,
@@ -214,7 +214,7 @@ class RollingShutterCamera:
         return DISTORTION_MODELS[self.distortion_model]
 
     @property
-    def _compiled(self) -> Lens:
+    def _compiled(self) -> CompiledLens:
         return self._lens.lens(self.distortion)
 
 

@@ -141,7 +141,7 @@ _PROFILE_KERNEL = KernelInterface(numba.void, 0.0, np.empty(1), np.empty(1))
 profile_at = _PROFILE_KERNEL.call
 
 
-class Lens(NamedTuple):
+class CompiledLens(NamedTuple):
     """Distortion of one camera in the form that kernels take."""
 
     profile: int  # address of the compiled kernel of the radial profile
@@ -163,7 +163,7 @@ class DistortionModel:
     first_guess: Callable[[Array], Array] = np.copy
     is_pinhole_at_zero: bool = True  # whether coefficients of zero distort nothing
 
-    def lens(self, coefficients: tuple[float, ...]) -> Lens:
+    def lens(self, coefficients: tuple[float, ...]) -> CompiledLens:
         """Make the lens with these coefficients; the coefficients that are not given are zero."""
         given = np.zeros(12)
         given[: len(coefficients)] = coefficients
@@ -171,7 +171,7 @@ class DistortionModel:
         sideways = np.zeros(6)
         radial[: len(self.radial)] = given[list(self.radial)]
         sideways[: len(self.sideways)] = given[list(self.sideways)]
-        return Lens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
+        return CompiledLens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
 
     def moved(self, coefficients: tuple[float, ...], by: Array) -> tuple[float, ...]:
         """Coefficients with `by` (3,) added to k1, k2, k3: as many as that needs.
@@ -225,7 +225,7 @@ _NEAREST = 1e-9
 
 
 @kernel
-def distort(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
+def distort(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -> None:
     """Write D(x, y) and d D / d(x, y), row by row, into `out` (6,); `profile` (9,) is filled."""
     r2 = x * x + y * y
     profile_at(lens.profile, r2, lens.radial, profile)
@@ -249,7 +249,7 @@ def distort(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
 
 
 @kernel
-def project_points(points: Array, lens: Lens) -> Array:
+def project_points(points: Array, lens: CompiledLens) -> Array:
     """Distorted normalised points (N, 2) of points (N, 3); NaN behind the camera."""
     out = np.empty((points.shape[0], 2))
     profile = np.empty(_PROFILE)
@@ -269,7 +269,9 @@ def project_points(points: Array, lens: Lens) -> Array:
 
 
 @kernel
-def undistort_points(points: Array, first_guesses: Array, lens: Lens) -> tuple[Array, Array]:
+def undistort_points(
+    points: Array, first_guesses: Array, lens: CompiledLens
+) -> tuple[Array, Array]:
     """Undistorted normalised points (N, 2) and their derivatives (N, 2, 2) by the distorted ones.
 
     NaN if there is no inverse. A root beyond the turning point of the polynomial is a mirror image
@@ -353,7 +355,7 @@ def project_rotating(
     rotations: Array,
     height: int,
     intrinsics: tuple[float, float, float, float],
-    lens: Lens,
+    lens: CompiledLens,
 ) -> Array:
     """`RollingShutterCamera.project_rotating` with `intrinsics` fx, fy, cx, cy.
 
@@ -412,7 +414,7 @@ def project_rotating(
 
 
 @kernel
-def _bends(x: float, y: float, lens: Lens, profile: Array, out: Array) -> None:
+def _bends(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -> None:
     """Write the second derivatives of D by (x, y) into `out` (2, 2, 2), component first."""
     slope = profile[1]
     bend = profile[2]
@@ -466,7 +468,11 @@ def _write_both(
 
 @kernel
 def points_by_lens(
-    distorted: Array, points: Array, by_distorted: Array, focal: tuple[float, float], lens: Lens
+    distorted: Array,
+    points: Array,
+    by_distorted: Array,
+    focal: tuple[float, float],
+    lens: CompiledLens,
 ) -> ByLens:
     """Derivatives of normalised points n by the pixel and by the lens.
 

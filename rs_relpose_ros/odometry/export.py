@@ -40,11 +40,17 @@ from rs_relpose_ros.tracking.images import CompressedImage, Pixels
 
 Ints = NDArray[np.int64]
 
+# Images as recorded.
 RAW = 'raw'
+# Images derotated to their middle row.
 UNROLLED = 'unrolled'
+# No images.
 NO_IMAGES = 'none'
+# Legal values of the option --images.
 IMAGE_CHOICES = (RAW, UNROLLED, NO_IMAGES)
+# Report of an export. [derived: interface]
 REPORT_FILE = 'export.json'
+# Picture of the exported model. [derived: interface]
 PICTURE = 'model.png'
 # Times that differ by less belong to one image: a correction of the offset or of the readout that
 # is tracked moves the time of a row a little from frame to frame. It must be shorter than half a

@@ -24,7 +24,9 @@ Ints = NDArray[np.int64]
 
 # The rows of an image whose poses a model has: indices into axis 1 of `Model.R`.
 MODEL_ROWS = ('start', 'middle', 'end')
-START, MIDDLE, END = range(len(MODEL_ROWS))
+START = 0  # index of the first row
+MIDDLE = 1  # index of the middle row
+END = 2  # index of the last row
 # From OpenGL's camera axes (x right, y up, z backward) to those of OpenCV.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # OpenCV counts pixels from the centre of the first one, all formats here from its corner.
@@ -533,7 +535,9 @@ class Format(NamedTuple):
     radial: int = 6
 
 
+# How two formats take poses of rows.
 _LINEAR = 'poses of the first and the last row, linear between'
+# Formats by the value of the option --format.
 FORMATS: Mapping[str, Format] = {
     'colmap': Format(_write_colmap, middle, 'one pose per image', 'unrolled'),
     'nerfstudio': Format(

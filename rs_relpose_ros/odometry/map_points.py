@@ -14,6 +14,7 @@ from rs_relpose_ros.odometry.formats import rotated, rotated_back
 from rs_relpose_ros.odometry.rows import ArrayFile, RowTrajectory
 from rs_relpose_ros.pipeline.pair import PairResult
 
+# Tracks of an odometry, for export. [derived: interface]
 TRACKS_FILE = 'tracks.npz'
 
 Ints = NDArray[np.int64]
@@ -34,6 +35,7 @@ _ROUNDS = 8
 _DEPTH_SIGMA = 0.05
 # Bounds against a division by zero: distance of a point [m], information of a direction.
 _LEAST_DISTANCE = 1e-3
+# [chosen: far below any real information]
 _LEAST_INFORMATION = 1e-12
 
 

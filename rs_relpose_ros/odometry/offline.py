@@ -41,17 +41,24 @@ from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FI
 from rs_relpose_ros.pipeline.chosen_pairs import Stamps
 from rs_relpose_ros.pipeline.pair import PairResult
 
+# Colour and width of each path in the picture.
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     'truth': {'color': 'black', 'lw': 2.5},
     'live': {'color': '#E69F00', 'lw': 1.2},
     'smoothed': {'color': '#0072B2', 'lw': 1.2},
 }
 
+# Path as it was published live. [derived: interface, as the files below]
 LIVE_FILE = 'trajectory.tum'
+# Path estimated from all data.
 SMOOTHED_FILE = 'trajectory_smoothed.tum'
+# States as they were published live.
 STATES_FILE = 'odometry.csv'
+# Poses at the rate that a user chose.
 RATE_FILE = 'trajectory_rows.tum'
+# Picture of the paths.
 PICTURE = 'path.png'
+# All files of the command `odometry`.
 _FILES = (
     LIVE_FILE,
     SMOOTHED_FILE,

@@ -143,6 +143,7 @@ class Measured(NamedTuple):
         return cls(images.R, np.array([0.0, 0.0, 1.0]), np.zeros(6))
 
 
+# Acceleration of free fall, z up [m/s^2]. [derived: standard gravity]
 _GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])
 # Shortest baseline [m] with a direction: against a division by zero.
 _LEAST_BASELINE = 1e-4
@@ -151,6 +152,7 @@ _LEAST_COSINE = 0.1
 # Columns of the derivatives: small rotation and translation of a body in its own axes, its
 # velocity, position of the camera, and its axes with the delay.
 COLUMNS = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'arm': 3, 'mount': 4})
+# Number of these columns. [derived: sum of the sizes]
 _WIDTH = 25
 
 

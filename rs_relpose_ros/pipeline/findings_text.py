@@ -54,7 +54,9 @@ class _Shown(NamedTuple):
     fix: str  # {}: the value to set
 
 
+# Text of an estimated and an active value.
 _COMPARED = 'estimated {}, active {}'
+# How each parameter is written.
 _SHOWN = {
     Code.AXES: _Shown(
         'deg',
@@ -178,6 +180,7 @@ def _other_wrong(finding: Finding) -> Text:
     return Text(f'not evaluated while {finding.parent.value} is wrong')
 
 
+# Texts that all parameters share.
 _BY_WHY: dict[Why, Callable[[Finding], Text]] = {
     Why.CONSISTENT: lambda finding: Text(_compared(finding)),
     Why.NOT_OBSERVABLE: lambda _: Text('not observable in this motion, or too few pairs'),
@@ -318,6 +321,7 @@ def _static_region(finding: Finding) -> Text:
     )
 
 
+# Texts of single causes, which come before the texts of `_BY_WHY`.
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,

@@ -29,6 +29,7 @@ Flags = NDArray[np.bool_]
 # Columns and rows of the cells. [chosen: a cell of 40 px in 640x480 holds some texture, and a
 # static part of a tenth of the image covers several cells; 10..24 columns would do]
 COLUMNS = 16
+# [chosen: cells that are nearly square in 4:3]
 ROWS = 12
 # Width of the reduced image [px]. Averaging reduces the noise of the sensor and of the
 # compression; a smaller image loses the texture. [chosen: 10 px for each cell]

@@ -35,11 +35,13 @@ from rs_relpose_ros.messages.incoming import TruePose
 # the other range in m/s^2. [chosen: a moving hand changes the median by some percent; any range
 # from (0.9, 1.1) to (0.3, 3) would do]
 _IN_GRAVITIES = (0.6, 1.5)
+# [derived: the same range in m/s^2]
 _IN_METRES = (0.6 * STANDARD_GRAVITY, 1.5 * STANDARD_GRAVITY)
 # A quaternion whose length differs by more from 1 is an error of the file. [chosen: digits of text
 # files give 1e-4; any value from 1e-3 to 1e-1 would do]
 _QUATERNION_TOLERANCE = 1e-2
 
+# Row to which the offsets here refer.
 _STAMP_ROW = SourcedValue('stamp_row', 'first', 'Convention of time_offset here.')
 
 

@@ -34,9 +34,11 @@ Reader = Callable[[Path], Recording]
 
 _MILLISECOND = 1e-6  # ns in ms
 
+# Row that Android stamps. [derived: documentation of SENSOR_TIMESTAMP]
 STAMP_ROW_OF_ANDROID = SourcedValue(
     'stamp_row', 'first', "Android's SENSOR_TIMESTAMP is that of the first row."
 )
+# Parameters that a logger does not determine.
 _DEFAULTS = (
     SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
     SourcedValue(
@@ -95,6 +97,7 @@ def phone_recording(
 
 # SENSOR_ORIENTATION of the back camera of most phones [deg].
 _USUAL_ORIENTATION = 90
+# Source of the axes, in words.
 _ORIENTATION = '{}: back camera with SENSOR_ORIENTATION {} deg, {}.'
 # The display orientation tells that of the sensor if the phone is held within this angle of one
 # of its four sides [deg]. [chosen: 45 is ambiguous; any value from 20 to 40 would do]

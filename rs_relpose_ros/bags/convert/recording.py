@@ -24,8 +24,11 @@ from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import TruePose
 from rs_relpose_ros.tracking.images import encoded_image_size
 
+# Formats of compressed images. [derived: compressed_image_transport]
 COLOUR_JPEG = 'bgr8; jpeg compressed bgr8'
+# The same for gray images without loss.
 GRAY_PNG = 'mono8; png compressed mono8'
+# Parameter of all converted bags.
 COMPRESSED = SourcedValue('image_transport', 'compressed', 'The bag holds compressed images.')
 
 # The bag has IMU samples until this time after the last image [ns]. Its rows need the readout

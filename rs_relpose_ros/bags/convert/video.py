@@ -30,6 +30,7 @@ START_NS = 1000 * NANOSECONDS
 # on it (docs/lab); up to 95 only the bag becomes larger]
 _JPEG_QUALITY = 90
 
+# What is said without a package.
 _ABSENT = (
     'videos need the Python package {}, which is not installed: pip install av telemetry-parser'
 )
@@ -62,6 +63,7 @@ def read_video(path: Path, lens_profile: Path | None) -> Recording:
     )
 
 
+# Parameters that a video does not determine.
 _CONVENTIONS = (
     SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
     SourcedValue(
@@ -181,6 +183,7 @@ _READOUTS = (
 )
 # A .gcsv has the direction separately; of its four values these are rows upwards, and columns.
 _UPWARDS = ('1', '180', 'BottomToTop')
+# Values of columns that are read one by one, which are refused.
 _COLUMNS = ('2', '270', 'LeftToRight', '3', '90', 'RightToLeft')
 
 # Group and tag of stabilisation, its values without it, its name, and the switch of the camera.
