@@ -73,7 +73,8 @@ class FrameTree:
 def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: float) -> float:
     """Angle [deg] by which a rotation of `sigma` [rad] contradicts that of a transform; else 0."""
     angle = float(Rotation.from_matrix(R @ other.T).magnitude())
-    return math.degrees(angle) if angle > math.hypot(AXES_SIGMA, 3.0 * sigma) else 0.0
+    allowed = math.hypot(AXES_SIGMA, 3.0 * sigma)
+    return math.degrees(angle) if angle > allowed else 0.0
 
 
 def extrinsics(

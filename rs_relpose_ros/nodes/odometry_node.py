@@ -1,7 +1,7 @@
 """odometry_node: metric odometry from the pairs of relpose_node and the IMU."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 import time
 from typing import Any
@@ -54,6 +54,16 @@ _LEVELS = {
     OdometryState.UNCERTAIN: 1,
     OdometryState.LOST: 2,
 }
+# Counters of the estimator on /diagnostics.
+_COUNTS = (
+    'pairs',
+    'contradicting',
+    'late',
+    'without images',
+    'dropped',
+    'lost',
+    'calibration contradicted',
+)
 _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
     f'subscribes: {_PAIRS}, imu, accel, camera_info, calibration\n'
@@ -313,19 +323,15 @@ class OdometryNode(StoppableNode):
 
     def _report(self) -> None:
         if self._path and self._path_topic.get_subscription_count():
-            self._path_topic.publish(
-                message_class('nav_msgs/msg/Path')(
-                    header=self._path[-1].header, poses=list(self._path)
-                )
-            )
+            path = message_class('nav_msgs/msg/Path')
+            self._path_topic.publish(path(header=self._path[-1].header, poses=list(self._path)))
         self.warn_of_namesake()
+        level, text = self._status()
+        self.publish_status(level, 'odometry', text, self._pairs, self._values())
+
+    def _status(self) -> tuple[int, str]:
+        """Level and text on /diagnostics; a problem is logged, too."""
         estimator = self._estimator
-        level, state = _LEVELS[estimator.state], estimator.state.value
-        if estimator.reason:
-            state = f'{state}: {estimator.reason}'
-        if blocking_reason := estimator.blocking_reason:
-            level, state = 2, f'not started: {blocking_reason}'
-            self._warn(state)
         for topic in self._silent:
             self._silent[topic] += 1
         silent = [
@@ -333,47 +339,43 @@ class OdometryNode(StoppableNode):
             for topic, reports in self._silent.items()
             if reports > _SILENCE
         ]
+        problems = []
+        if estimator.blocking_reason:
+            problems.append(f'not started: {estimator.blocking_reason}')
         if silent:
-            level, state = (
-                2,
-                (
-                    f'no message on {" and ".join(silent)}: start or remap what '
-                    'publishes it (relpose_node, the driver of the IMU)'
-                ),
+            problems.append(
+                f'no message on {" and ".join(silent)}: start or remap what publishes it '
+                '(relpose_node, the driver of the IMU)'
             )
-            self._warn(state)
-        values = [
-            ('state', estimator.state.value),
-            ('reason', estimator.reason),
-            *(
-                (name.replace(' ', '_'), str(estimator.counts[name]))
-                for name in (
-                    'pairs',
-                    'contradicting',
-                    'late',
-                    'without images',
-                    'dropped',
-                    'lost',
-                    'calibration contradicted',
-                )
-            ),
-            *(
-                (name, ' '.join(f'{value:.3f}' for value in vector))
-                for name, vector in zip(
-                    ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True
-                )
-            ),
-        ]
+        for problem in problems:
+            self._warn(problem)
+        if problems:
+            return 2, problems[-1]
+        state = estimator.state.value
+        text = f'{state}: {estimator.reason}' if estimator.reason else state
+        return _LEVELS[estimator.state], text
+
+    def _values(self) -> list[tuple[str, str]]:
+        """The fields of /diagnostics."""
+        estimator = self._estimator
+        values = [('state', estimator.state.value), ('reason', estimator.reason)]
+        for name in _COUNTS:
+            values.append((name.replace(' ', '_'), str(estimator.counts[name])))
+        position, position_sigma = estimator.imu_position
+        values.append(('imu_position', _numbers(position, '.3f')))
+        values.append(('imu_position_sigma', _numbers(position_sigma, '.3f')))
         for name, (deviation, sigma) in estimator.deviations.items():
-            values.append((f'{name}_deviation', ' '.join(f'{value:.3g}' for value in deviation)))
-            values.append((f'{name}_deviation_sigma', ' '.join(f'{one:.3g}' for one in sigma)))
+            values.append((f'{name}_deviation', _numbers(deviation, '.3g')))
+            values.append((f'{name}_deviation_sigma', _numbers(sigma, '.3g')))
         if estimator.starts:
             started = estimator.starts[-1]
-            values += [
-                ('started', 'at rest' if started.at_rest else 'in motion'),
-                ('start_scale_sigma', f'{started.scale_sigma:.3f}'),
-            ]
-        self.publish_status(level, 'odometry', state, self._pairs, values)
+            values.append(('started', 'at rest' if started.at_rest else 'in motion'))
+            values.append(('start_scale_sigma', f'{started.scale_sigma:.3f}'))
+        return values
+
+
+def _numbers(values: Iterable[float], form: str) -> str:
+    return ' '.join(f'{value:{form}}' for value in values)
 
 
 main = partial(run_node, OdometryNode, NAME, _DESCRIPTION)
