@@ -16,8 +16,8 @@ from rs_relpose_ros.bags.storage import (
     DamagedError,
     Entry,
     KeptChunks,
-    MAX_CHUNK_BYTES,
     qos_profiles,
+    read_exactly,
     Source,
     StoredTopic,
 )
@@ -73,13 +73,21 @@ class McapStorage:
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""
         for kind, start, size in self._records(len(Source.MCAP.value), self._end):
-            if kind == _MESSAGE:
+            if kind == _CHUNK:
+                yield from self._entries_of_chunk(start)
+            elif kind == _MESSAGE:
                 yield self._entry(self._read(start, size), start, -1)
-            elif kind == _CHUNK:
-                chunk = memoryview(self._chunks[start])
-                for inner, offset, length in _records_of(chunk):
-                    if inner == _MESSAGE:
-                        yield self._entry(chunk[offset : offset + length], start, offset)
+            elif kind in (_SCHEMA, _CHANNEL):
+                self._describe(kind, self._read(start, size))
+
+    def _entries_of_chunk(self, place: int) -> Iterator[Entry]:
+        chunk = memoryview(self._chunks[place])
+        for kind, start, size in _records_of(chunk):
+            record = chunk[start : start + size]
+            if kind == _MESSAGE:
+                yield self._entry(record, place, start)
+            elif kind in (_SCHEMA, _CHANNEL):
+                self._describe(kind, bytes(record))
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""
@@ -97,19 +105,12 @@ class McapStorage:
         return Entry(channel, time_ns, place, offset, record[_MESSAGE_HEAD.size :])
 
     def _read(self, start: int, size: int) -> bytes:
-        if size > MAX_CHUNK_BYTES:
-            raise DamagedError(f'a record has {size} bytes')
-        data = os.pread(self._file.fileno(), size, start)
-        if len(data) < size:
-            raise DamagedError('it ends within a record')
-        return data
+        return read_exactly(self._file, start, size)
 
     def _find_end(self) -> int:
         """Set the end of the data; start of the summary, 0 if there is none."""
         file_size = os.fstat(self._file.fileno()).st_size
-        if file_size < len(Source.MCAP.value) + _FOOTER.size:
-            raise DamagedError('it ends within a record')
-        footer = file_size - _FOOTER.size
+        footer = max(file_size - _FOOTER.size, len(Source.MCAP.value))
         kind, size, summary, _, _, magic = _FOOTER.unpack(self._read(footer, _FOOTER.size))
         if (kind, size, magic) != (0x02, 20, Source.MCAP.value) or summary > footer:
             raise DamagedError('it has no end')
@@ -128,29 +129,12 @@ class McapStorage:
     def _count_messages(self) -> None:
         """Read topics and counts from the data."""
         self._counts.clear()
-        times: list[int] = []
-        for kind, start, size in self._records(len(Source.MCAP.value), self._end):
-            if kind in (_SCHEMA, _CHANNEL):
-                self._describe(kind, self._read(start, size))
-            elif kind == _CHUNK:
-                chunk = memoryview(self._chunks[start])
-                for inner, offset, length in _records_of(chunk):
-                    record = chunk[offset : offset + length]
-                    if inner == _MESSAGE:
-                        times.append(self._count(record))
-                    elif inner in (_SCHEMA, _CHANNEL):
-                        self._describe(inner, bytes(record))
-            elif kind == _MESSAGE:
-                times.append(self._count(self._read(start, size)))
-            if times:
-                times[:] = [min(times), max(times)]
-        self.start_ns, self.end_ns = (times[0], times[-1]) if times else (0, 0)
-
-    def _count(self, record: bytes | memoryview) -> int:
-        """Count a message; its time."""
-        channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(record)
-        self._counts[channel] += 1
-        return int(time_ns)
+        first = last = None
+        for entry in self.entries():
+            self._counts[entry.topic_id] += 1
+            first = entry.time_ns if first is None else min(first, entry.time_ns)
+            last = entry.time_ns if last is None else max(last, entry.time_ns)
+        self.start_ns, self.end_ns = first or 0, last or 0
 
     def _describe(self, kind: int, record: bytes) -> None:
         """Keep a schema, a channel or the statistics."""

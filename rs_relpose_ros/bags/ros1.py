@@ -20,7 +20,7 @@ from rs_relpose_ros.bags.storage import (
     DamagedError,
     Entry,
     KeptChunks,
-    MAX_CHUNK_BYTES,
+    read_exactly,
     StoredTopic,
     UnfinishedError,
 )
@@ -116,12 +116,7 @@ class Ros1Storage:
         return chunk[offset : offset + size]
 
     def _read(self, start: int, size: int) -> bytes:
-        if size > MAX_CHUNK_BYTES:
-            raise DamagedError(f'a record has {size} bytes')
-        data = os.pread(self._file.fileno(), size, start)
-        if len(data) < size:
-            raise DamagedError('it ends within a record')
-        return data
+        return read_exactly(self._file, start, size)
 
     def _record(self, start: int) -> tuple[dict[str, bytes], int, int]:
         """Fields of the header of a record in the file, start of its data, and their size."""

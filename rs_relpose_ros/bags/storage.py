@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterator
 import contextlib
 from enum import Enum
 import importlib
+import os
 import sys
-from typing import Any, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import (
@@ -135,6 +136,16 @@ def message_data(data: bytes | memoryview) -> bytes:
     data = bytes(data)
     if data[:4] == ZSTD_MAGIC:
         return decompressed(zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES)
+    return data
+
+
+def read_exactly(file: BinaryIO, start: int, size: int) -> bytes:
+    """Bytes of a record at a place of an unbuffered file."""
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(f'a record has {size} bytes')
+    data = os.pread(file.fileno(), size, start)
+    if len(data) < size:
+        raise DamagedError('it ends within a record')
     return data
 
 
