@@ -25,9 +25,12 @@ from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
-# Largest values of an IMU: far above any sensor, far below an overflow of the filters.
-MAX_ANGULAR_VELOCITY = 1e3  # rad/s
-MAX_LINEAR_ACCELERATION = 1e4  # m/s^2
+# Largest angular velocity [rad/s] that is accepted. Larger ones overflow the filters and come from
+# damaged messages or from degrees. [chosen: sensors end at 70 rad/s; 100 to 10^6 would do]
+MAX_ANGULAR_VELOCITY = 1e3
+# Largest specific force [m/s^2] that is accepted, for the same reasons. [chosen: sensors of shocks
+# end at 4000 m/s^2; any value from there to 10^6 would do]
+MAX_LINEAR_ACCELERATION = 1e4
 
 
 class TruePose(NamedTuple):
@@ -114,12 +117,9 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
 
 def _orientation(msg: Any) -> tuple[float, float, float, float] | None:
     """Down and its sigma [rad]; None without usable variances (0: unknown by REP-145)."""
-    q, about_x, about_y = (
-        msg.orientation,
-        float(msg.orientation_covariance[0]),
-        float(msg.orientation_covariance[4]),
-    )
+    q, covariance = msg.orientation, msg.orientation_covariance
     x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    about_x, about_y = float(covariance[0]), float(covariance[4])
     variance = max(about_x, about_y)
     norm2 = x * x + y * y + z * z + w * w
     if not (about_x > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
@@ -199,14 +199,18 @@ def sensor_messages(
 # They repeat their values bit by bit, which noise never does. Repeated values with new stamps
 # would give wrong poses that look good.
 
-# Stride of the bytes of two images that are compared first: nearly always one of them differs.
+# Stride of the bytes of two images that are compared first: nearly always one of them differs, and
+# the comparison ends there. [chosen: a prime, so that all columns are met; 100 to 10 000 would do]
 _STRIDE = 1009
-# Fewest equal samples of a stuck gyro: two or three of a slow one may be equal by chance.
+# Fewest equal samples of a stuck gyro. With fewer, a slow gyro would be a fault whose two or three
+# samples are equal by chance. [chosen: 4 to 10 would do]
 _FEWEST_SAMPLES = 4
-# Smallest range of a gyro [rad/s]: no product has less than 125 deg/s.
+# Smallest range of a gyro [rad/s]: an axis that repeats a larger value is saturated.
+# [derived: no product has less than 125 deg/s]
 _LEAST_RANGE = 2.0
-# Smallest value [rad/s] at which a driver or filter clips: it is the largest value so far, and
-# larger than the bias that a gyro of coarse resolution repeats at rest.
+# Smallest value [rad/s] at which a driver or filter clips: it is the largest value so far. A
+# smaller limit would take for clipping the bias that a gyro of coarse resolution repeats at rest.
+# [chosen: biases stay below 0.1]
 _LEAST_CLIPPING = 0.2
 
 
@@ -237,43 +241,49 @@ class StuckGyro:
 
     def repeats(self, sample: ImuSample) -> bool:
         """Whether this sample repeats the last one; InputError if that lasts too long."""
-        if sample.angular_velocity is None or self._longest_ns == 0:
+        rate = sample.angular_velocity
+        if rate is None or self._longest_ns == 0:
             return False
-        for axis, value in enumerate(sample.angular_velocity):
-            # After the clock was set back the time of repetition counts from here.
-            if value != self._values[axis] or sample.stamp_ns < self._since_ns[axis]:
-                self._values[axis], self._since_ns[axis] = value, sample.stamp_ns
-                self._counts[axis] = 0
-            self._counts[axis] += 1
-            self._largest[axis] = max(self._largest[axis], abs(value))
-        count, since_ns, fault = (
-            min(self._counts),
-            max(self._since_ns),
-            (
-                'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time '
-                'to 0 '
-                'for a simulation without noise)'
-            ),
+        for axis, value in enumerate(rate):
+            self._add(axis, value, sample.stamp_ns)
+        count, since_ns = min(self._counts), max(self._since_ns)
+        fault = (
+            'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
+            'for a simulation without noise)'
         )
-        if count == 1:
-            for axis, value in enumerate(sample.angular_velocity):
-                if self._counts[axis] > 1 and abs(value) >= min(
-                    _LEAST_RANGE, max(_LEAST_CLIPPING, self._largest[axis])
-                ):
-                    count, since_ns = self._counts[axis], self._since_ns[axis]
-                    fault = (
-                        f'the {"xyz"[axis]} axis of the gyro repeats {value:.4g} rad/s bit '
-                        'by bit: it is saturated'
-                    )
-                    break
+        clipped = self._clipped_axis(rate) if count == 1 else None
+        if clipped is not None:
+            count, since_ns = self._counts[clipped], self._since_ns[clipped]
+            fault = (
+                f'the {"xyz"[clipped]} axis of the gyro repeats {rate[clipped]:.4g} rad/s bit by '
+                'bit: it is saturated'
+            )
         if count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns:
             raise InputError(fault)
         return count > 1
 
+    def _add(self, axis: int, value: float, stamp_ns: int) -> None:
+        # After the clock was set back the time of repetition counts from here.
+        if value != self._values[axis] or stamp_ns < self._since_ns[axis]:
+            self._values[axis] = value
+            self._since_ns[axis] = stamp_ns
+            self._counts[axis] = 0
+        self._counts[axis] += 1
+        self._largest[axis] = max(self._largest[axis], abs(value))
+
+    def _clipped_axis(self, rate: tuple[float, float, float]) -> int | None:
+        """The first axis that repeats a value at which a driver or a filter may clip."""
+        for axis, value in enumerate(rate):
+            clipping = min(_LEAST_RANGE, max(_LEAST_CLIPPING, self._largest[axis]))
+            if self._counts[axis] > 1 and abs(value) >= clipping:
+                return axis
+        return None
+
 
 # -- Into the sequencer, live and offline ---------------------------------------------------------
 
-# Most images that wait for the first CameraInfo, which may come before or after its image.
+# Most images that wait for the first CameraInfo, which may come before or after its image. More
+# only delay the refusal of images that have none. [chosen: 1 to 10 would do]
 _HELD_IMAGES = 4
 
 
@@ -362,39 +372,36 @@ class Intake:
             self._add_frame(self._held.pop(0))
 
     def _add_frame(self, image: images.EncodedImage) -> None:
-        try:
-            if self._configured is not None:
+        if self._configured is not None:
+            try:
                 size, last = image.size, self.intrinsics
                 if last is None or size != (last.image_width, last.image_height):
                     self.intrinsics = self._configured.of_image(*size)
-        except InputError as error:
-            self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
-            return
+            except InputError as error:
+                self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+                return
         if self.intrinsics is None:
-            self._sequencer.refuse(
-                image.stamp_ns,
-                Refusal.NO_CALIBRATION,
-                self.camera_info_problem or 'no CameraInfo came before or with the image',
-            )
+            problem = self.camera_info_problem or 'no CameraInfo came before or with the image'
+            self._sequencer.refuse(image.stamp_ns, Refusal.NO_CALIBRATION, problem)
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
         before, self._last = self._last, image
         if before is not None and repeats(before, image):
-            self._sequencer.refuse(
-                image.stamp_ns,
-                Refusal.BAD_IMAGE,
-                'the image repeats the one before bit by bit: '
-                'the camera or its driver is stuck, or the image is empty',
+            problem = (
+                'the image repeats the one before bit by bit: the camera or its driver is stuck, '
+                'or the image is empty'
             )
-        else:
-            self._sequencer.add_frame(image, self.intrinsics)
+            self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
+            return
+        self._sequencer.add_frame(image, self.intrinsics)
 
 
 # -- Messages about bad input, grouped by reason --------------------------------------------------
 
-# Numbers differ between messages of one reason.
+# Numbers differ between messages of one reason. [derived: notations of Python's numbers]
 _NUMBERS = re.compile(r'[-+]?\d[\d.e+-]*')
 # Most reasons that are distinguished: a source of ever new texts must not fill log or memory.
+# [chosen: a run has up to ten; 20 to 1000 would do]
 MOST_REASONS = 64
 
 
