@@ -24,16 +24,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
 from rs_relpose_ros.jit import kernel, small_kernel
 
 # First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
-# plane, and four vectors.
-PARAMETERS = 17
-# After those, if unknown: the logarithm of the velocities' scale.
-SCALE = 17
-THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
+# plane, and four vectors. The logarithm of the velocities' scale follows after them if it is
+# unknown, too.
+_UNKNOWNS = slices({'theta': 3, 'tangent': 2, 'd1': 3, 'd2': 3, 'dw1': 3, 'dw2': 3, 'scale': 1})
+THETA = _UNKNOWNS['theta'].start
+TANGENT = _UNKNOWNS['tangent'].start
+D1 = _UNKNOWNS['d1'].start
+D2 = _UNKNOWNS['d2'].start
+DW1 = _UNKNOWNS['dw1'].start
+DW2 = _UNKNOWNS['dw2'].start
+SCALE = _UNKNOWNS['scale'].start
+PARAMETERS = SCALE
 
 
 class TwoViewState(NamedTuple):
@@ -69,34 +76,32 @@ def signed(state: TwoViewState, sign: float) -> TwoViewState:
 @kernel
 def moved(state: TwoViewState, step: Array) -> TwoViewState:
     """The state after a step (17,) of its local parameters."""
-    basis = tangent_basis(state.t)
-    t, d1, d2, dw1, dw2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        t[i] = state.t[i] + basis[i, 0] * step[TANGENT] + basis[i, 1] * step[TANGENT + 1]
-        d1[i], d2[i] = state.d1[i] + step[D1 + i], state.d2[i] + step[D2 + i]
-        dw1[i], dw2[i] = state.dw1[i] + step[DW1 + i], state.dw2[i] + step[DW2 + i]
-    length = norm(t)
-    for i in range(3):
-        t[i] /= length
-    return TwoViewState(exp_so3(step[:3]) @ state.R, t, d1, d2, dw1, dw2)
+    t = state.t + tangent_basis(state.t) @ step[TANGENT:D1]
+    return TwoViewState(
+        exp_so3(step[THETA:TANGENT]) @ state.R,
+        t / norm(t),
+        state.d1 + step[D1:D2],
+        state.d2 + step[D2:DW1],
+        state.dw1 + step[DW1:DW2],
+        state.dw2 + step[DW2:PARAMETERS],
+    )
 
 
 @kernel
 def step_between(state: TwoViewState, other: TwoViewState) -> Array:
     """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
-    step = np.empty(PARAMETERS)
     turn = log_so3(other.R @ state.R.T)
-    basis = tangent_basis(state.t)
-    along = dot(state.t, other.t)
-    for k in range(2):
-        step[TANGENT + k] = dot(basis[:, k], other.t) / along
-    for k in range(3):
-        step[THETA + k] = turn[k]
-        step[D1 + k] = other.d1[k] - state.d1[k]
-        step[D2 + k] = other.d2[k] - state.d2[k]
-        step[DW1 + k] = other.dw1[k] - state.dw1[k]
-        step[DW2 + k] = other.dw2[k] - state.dw2[k]
-    return step
+    tangent = other.t @ tangent_basis(state.t) / dot(state.t, other.t)
+    return np.concatenate(
+        (
+            turn,
+            tangent,
+            other.d1 - state.d1,
+            other.d2 - state.d2,
+            other.dw1 - state.dw1,
+            other.dw2 - state.dw2,
+        )
+    )
 
 
 # A weight that fixes its unknowns: the angular, linear and global models as cases of the uniform

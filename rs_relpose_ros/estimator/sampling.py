@@ -140,6 +140,13 @@ def draw(
 
 
 @small_kernel
+def _write_ray(x: float, y: float, ray: Array) -> None:
+    """Write the unit ray of a point (x, y) at z = 1."""
+    inverse_length = 1.0 / math.sqrt(1.0 + x * x + y * y)
+    ray[0], ray[1], ray[2] = x * inverse_length, y * inverse_length, inverse_length
+
+
+@small_kernel
 def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
     """Write unit rays and row times of the chosen matches; False if one is not usable."""
     for k in range(chosen.shape[0]):
@@ -147,10 +154,8 @@ def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> b
         x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
         if math.isnan(x1):
             return False
-        s1 = 1.0 / math.sqrt(1.0 + x1 * x1 + y1 * y1)
-        s2 = 1.0 / math.sqrt(1.0 + x2 * x2 + y2 * y2)
-        sample.f1[k, 0], sample.f1[k, 1], sample.f1[k, 2] = x1 * s1, y1 * s1, s1
-        sample.f2[k, 0], sample.f2[k, 1], sample.f2[k, 2] = x2 * s2, y2 * s2, s2
+        _write_ray(x1, y1, sample.f1[k])
+        _write_ray(x2, y2, sample.f2[k])
         sample.tau1[k], sample.tau2[k] = points[4, i], points[5, i]
     return True
 
@@ -437,10 +442,20 @@ def optimise(
 
 # -- The alternative to a pose whose rotation follows the gyro: any rotation ----------------------
 
-# Rounds of its fit, Gauss-Newton steps and weights of each (Cauchy, in sigmas), and the round by
-# which it must be the likelier one: it rarely is if the pose is right.
-_FREE_ROUNDS, _FREE_STEPS, _FREE_SIGMAS, _PROMISING = 6, 2, 2.4, 2
-_LEAST_SCALE = 0.05  # of residuals [px]
+# Rounds of its fit. More rounds gain little: the weights hardly change any more.
+# [chosen: each costs as much as two steps of a fit, any value in 4..10 would do]
+_FREE_ROUNDS = 6
+# Gauss-Newton steps of each round. [chosen: the weights change more than the state]
+_FREE_STEPS = 2
+# Scale of the Cauchy weights [sigma of the residuals].
+# [derived: 95 % efficiency for Gaussian residuals (2.385)]
+_FREE_SIGMAS = 2.4
+# Round by which the free rotation must be the likelier one. It rarely is if the pose is right, so
+# that this bounds the cost of a good pair. [chosen: any value in 1..3 would do]
+_PROMISING = 2
+# Least scale of the residuals [px]: those of exact matches vanish.
+# [chosen: half of the noise of the best tracks]
+_LEAST_SCALE = 0.05
 
 
 @kernel

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.core.epipolar import by_motion, residual, View
 from rs_relpose_ros.core.losses import Flags
 from rs_relpose_ros.core.triangulate import depths
@@ -33,34 +34,39 @@ from rs_relpose_ros.estimator.priors import (
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
-# Matches of a block: enough to vectorise, few enough for the nearest cache.
+# Matches of a block. Fewer leave a part of the vector registers unused; more do not fit into the
+# nearest cache with their rows. [chosen: any multiple of 8 in 32..128 would do]
 BLOCK = 64
 # First numbers of an observation: the vectors of both views, and the two row times. A block has
 # the root of the weight behind them.
-VIEW_1 = 0
-VIEW_2 = 9
-TIMES = 18
-OBSERVATION = 20
+_PARTS = slices({'view_1': 9, 'view_2': 9, 'times': 2})
+VIEW_1 = _PARTS['view_1'].start
+VIEW_2 = _PARTS['view_2'].start
+TIMES = _PARTS['times'].start
+OBSERVATION = _PARTS['times'].stop
 ROOT = OBSERVATION
 
 
 class Motion(NamedTuple):
-    """A two-view state as polynomials in the row times."""
+    """A two-view state, and the rotations of its rays as polynomials in the row times."""
 
-    baseline: Array  # (3, 3) coefficients of b in 1, tau_1 and tau_2, one per row
-    rotation_1: Array  # (3, 3, 3) coefficients of the first rays' rotation in 1, tau_1, tau_1^2
-    rotation_2: Array  # (3, 3, 3) coefficients of the second rays' rotation in 1, tau_2, tau_2^2
+    state: TwoViewState
+    rotation_1: Array  # (3, 3, 3) coefficients of ``Exp(tau_1 dw_1)`` in 1, tau_1, tau_1^2
+    rotation_2: Array  # (3, 3, 3) coefficients of ``Exp(tau_2 dw_2) R`` in 1, tau_2, tau_2^2
 
 
 @inlined_kernel
 def _motion(state: TwoViewState) -> Motion:
-    """Expand ``t - tau_1 d_1 + tau_2 d_2``, ``Exp(tau_1 dw_1)`` and ``Exp(tau_2 dw_2) R``."""
-    baseline = np.empty((3, 3))
-    for k in range(3):
-        baseline[0, k], baseline[1, k], baseline[2, k] = state.t[k], -state.d1[k], state.d2[k]
     return Motion(
-        baseline, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
+        state, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
     )
+
+
+@inlined_kernel
+def _baseline(state, tau1, tau2):  # type: ignore[no-untyped-def]
+    """``t - tau_1 d_1 + tau_2 d_2``."""
+    moved = so3.add(so3.scale(-tau1, state.d1), so3.scale(tau2, state.d2))
+    return so3.add(state.t, moved)
 
 
 @inlined_kernel
@@ -90,31 +96,29 @@ def _row_at(series, i, tau):  # type: ignore[no-untyped-def]
 
 
 @inlined_kernel
+def _times(rows, v):  # type: ignore[no-untyped-def]
+    """Product of a matrix, given by its three rows, and a vector."""
+    return so3.dot(rows[0], v), so3.dot(rows[1], v), so3.dot(rows[2], v)
+
+
+@inlined_kernel
 def _view_at(block, i, first, series, tau):  # type: ignore[no-untyped-def]
     """Rotated ray of match i and its derivatives; its values begin in row `first` of the block."""
-    row_x, row_y, row_z = _row_at(series, 0, tau), _row_at(series, 1, tau), _row_at(series, 2, tau)
-    ray = (block[first, i], block[first + 1, i], block[first + 2, i])
-    by_u = (block[first + 3, i], block[first + 4, i], block[first + 5, i])
-    by_v = (block[first + 6, i], block[first + 7, i], block[first + 8, i])
+    rotation = (_row_at(series, 0, tau), _row_at(series, 1, tau), _row_at(series, 2, tau))
     return View(
-        (so3.dot(row_x, ray), so3.dot(row_y, ray), so3.dot(row_z, ray)),
-        (so3.dot(row_x, by_u), so3.dot(row_y, by_u), so3.dot(row_z, by_u)),
-        (so3.dot(row_x, by_v), so3.dot(row_y, by_v), so3.dot(row_z, by_v)),
+        _times(rotation, so3.column(block, first, i)),
+        _times(rotation, so3.column(block, first + 3, i)),
+        _times(rotation, so3.column(block, first + 6, i)),
     )
 
 
 @inlined_kernel
 def _match(block, i, motion):  # type: ignore[no-untyped-def]
     """Both views of match i of a block, and the baseline between its rows."""
-    tau1, tau2, b = block[TIMES, i], block[TIMES + 1, i], motion.baseline
-    baseline = (
-        b[0, 0] + tau1 * b[1, 0] + tau2 * b[2, 0],
-        b[0, 1] + tau1 * b[1, 1] + tau2 * b[2, 1],
-        b[0, 2] + tau1 * b[1, 2] + tau2 * b[2, 2],
-    )
+    tau1, tau2 = block[TIMES, i], block[TIMES + 1, i]
     first = _view_at(block, i, VIEW_1, motion.rotation_1, tau1)
     second = _view_at(block, i, VIEW_2, motion.rotation_2, tau2)
-    return first, second, baseline
+    return first, second, _baseline(motion.state, tau1, tau2)
 
 
 @kernel
@@ -127,21 +131,15 @@ def _gather(observations: Array, weights: Array, first: int, block: Array) -> tu
     count = 0
     while first < observations.shape[0] and count < BLOCK:
         if weights[first] > 0.0:
-            for k in range(20):
+            for k in range(OBSERVATION):
                 block[k, count] = observations[first, k]
-            block[20, count] = math.sqrt(weights[first])
+            block[ROOT, count] = math.sqrt(weights[first])
             count += 1
         first += 1
     for i in range(count, BLOCK):
-        for k in range(21):
+        for k in range(OBSERVATION + 1):
             block[k, i] = 0.0
     return first, count
-
-
-@inlined_kernel
-def _write(rows, first, i, values):  # type: ignore[no-untyped-def]
-    """Write a vector into column i of `rows`, from row `first` on."""
-    rows[first, i], rows[first + 1, i], rows[first + 2, i] = values
 
 
 @inlined_kernel
@@ -155,14 +153,13 @@ def _linearise(block, motion, basis, rows):  # type: ignore[no-untyped-def]
         by_baseline = so3.scale(root, by_baseline)
         by_rotation_1 = so3.scale(root, by_rotation_1)
         by_rotation_2 = so3.scale(root, by_rotation_2)
-        _write(rows, THETA, i, by_rotation_2)
-        for k in range(2):
-            column = (basis[0, k], basis[1, k], basis[2, k])
-            rows[TANGENT + k, i] = so3.dot(by_baseline, column)
-        _write(rows, D1, i, so3.scale(-tau1, by_baseline))
-        _write(rows, D2, i, so3.scale(tau2, by_baseline))
-        _write(rows, DW1, i, so3.scale(tau1, by_rotation_1))
-        _write(rows, DW2, i, so3.scale(tau2, by_rotation_2))
+        so3.write_column(by_rotation_2, rows, THETA, i)
+        rows[TANGENT, i] = so3.dot(by_baseline, so3.column(basis, 0, 0))
+        rows[TANGENT + 1, i] = so3.dot(by_baseline, so3.column(basis, 0, 1))
+        so3.write_column(so3.scale(-tau1, by_baseline), rows, D1, i)
+        so3.write_column(so3.scale(tau2, by_baseline), rows, D2, i)
+        so3.write_column(so3.scale(tau1, by_rotation_1), rows, DW1, i)
+        so3.write_column(so3.scale(tau2, by_rotation_2), rows, DW2, i)
         rows[PARAMETERS, i] = root * at.value
 
 
@@ -237,27 +234,31 @@ def triangulated(
     NaN if the rays are parallel.
     """
     o = observations[i]
-    tau1, tau2 = o[18], o[19]
-    t, d1, d2 = state.t, state.d1, state.d2
-    b = (
-        t[0] - tau1 * d1[0] + tau2 * d2[0],
-        t[1] - tau1 * d1[1] + tau2 * d2[1],
-        t[2] - tau1 * d1[2] + tau2 * d2[2],
-    )
-    depth1, depth2, parallax = depths(o[0:3], so3.rotated(state.R, o[9:12]), b)
+    b = _baseline(state, o[TIMES], o[TIMES + 1])
+    h = so3.rotated(state.R, o[VIEW_2 : VIEW_2 + 3])
+    depth1, depth2, parallax = depths(o[VIEW_1 : VIEW_1 + 3], h, b)
     return depth1, depth2, parallax, so3.norm(b)
 
 
 # -- Inliers of a state: by residuals and by depths -----------------------------------------------
 
-# A depth is tested only if the parallax is this many times its noise.
+# Parallax, in units of its noise, from which on a depth is tested. With less, the sign of a depth
+# is noise, and good matches far away would be lost. [derived: one depth in 30 000 has the wrong
+# sign at 4 sigmas]
 SIGNIFICANT_PARALLAX = 4.0
-# A match is an outlier if the logarithm of its depth is this many times as far from the median as
-# the quantile of one sigma on that side.
+# Largest distance of the logarithm of a depth from the median, in units of the distance of the
+# quantile on that side. A smaller gate removes near points, which determine most of the
+# translation; a larger one keeps random matches. [derived: 4 sigmas of a log-normal depth]
 DEPTH_GATE = 4.0
+# Quantiles of the depths: one sigma below the median, the median, and one sigma above.
+# [derived: of the normal distribution]
 DEPTH_QUANTILES = (0.16, 0.5, 0.84)
-# Least spread of the depths of a scene (log units): keeps the gate open on planar scenes.
+# Least spread of the depths of a scene (log units). It keeps the gate open on planar scenes.
+# [chosen: e^(4 * 0.25), a factor of e in depth, any value in 0.15..0.5 would do]
 MIN_DEPTH_SPREAD = 0.25
+# Number of tested depths below which their quantiles say nothing.
+# [chosen: any value in 6..20 would do]
+_FEWEST_DEPTHS = 8
 
 
 class RayMatches(NamedTuple):
@@ -291,10 +292,8 @@ def count_behind(matches: RayMatches, use: Flags, state: TwoViewState) -> int:
     for i in range(len(use)):
         if use[i]:
             depth1, depth2, parallax, _ = triangulated(matches.observations, i, state)
-            if (
-                parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
-                and min(depth1, depth2) <= 0.0
-            ):
+            significant = parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
+            if significant and min(depth1, depth2) <= 0.0:
                 count += 1
     return count
 
@@ -309,7 +308,9 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
     n = len(r)
     use = np.empty(n, dtype=np.bool_)
     # Depths in units of the distance between the camera's places at the two rows; NaN: untested.
-    relative, known, count = np.full(n, np.nan), np.empty(n), 0
+    relative = np.full(n, np.nan)
+    known = np.empty(n)
+    count = 0
     for i in range(n):
         use[i] = matches.valid[i] and abs(r[i]) < threshold
         if not use[i]:
@@ -322,16 +323,14 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
             continue
         relative[i] = known[count] = min(depth1, depth2) / baseline
         count += 1
-    if count < 8:
+    if count < _FEWEST_DEPTHS:
         return use
     # Near and far side separately: a scene is denser far away, and its few near points, which
     # resemble outliers, determine most of the translation.
     known, last = known[:count], count - 1
-    near, centre, far = (
-        math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last))),
-        math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last))),
-        math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last))),
-    )
+    near = math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last)))
+    centre = math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last)))
+    far = math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last)))
     lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
     highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
     for i in range(n):
