@@ -410,7 +410,7 @@ def adjust(
     return Adjusted(
         state,
         noise,
-        _covariance(normal, state, priors, (sigma / noise) ** 2, tracks.number),
+        _covariance(normal, state, priors, COMMON_SIGMA / sigma, tracks.number),
         normal.squares > (_FARTHEST * sigma) ** 2,
     )
 
@@ -419,12 +419,18 @@ def adjust(
 def _covariance(
     normal: Normal, state: PathState, priors: PathPriors, common: float, count: int
 ) -> Array:
-    """Of the path (n, n), with the scatter of the tracks' gradients (sandwich), times `common`.
+    """Covariance (n, n) of the path, by the scatter of the tracks' gradients (sandwich).
 
-    The errors of one track in consecutive frames are similar, those of the `count` tracks are not.
+    The errors of one track in consecutive frames are similar, the errors of the `count` tracks
+    are independent. `common`: sigma of the error that the residuals do not show, in units of the
+    sigma of an observation; its part of the scatter follows from the Hessian of the observations.
     """
     n = len(normal.gradient)
-    scatter = common * count / max(count - n / TRACK_UNKNOWNS, 1.0) * normal.scatter
-    _add_priors(state, priors, scatter, np.zeros(n))
+    information = np.zeros((n, n))
+    _add_priors(state, priors, information, np.zeros(n))
+    # Few tracks scatter less than many: the fit has adapted to them.
+    of_few = count / max(count - n / TRACK_UNKNOWNS, 1.0)
+    of_common = common * common * (normal.hessian - information)
+    scatter = of_few * normal.scatter + of_common + information
     covariance = inverse(normal.hessian)
     return covariance @ scatter @ covariance
