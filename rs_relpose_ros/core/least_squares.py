@@ -7,12 +7,26 @@ that takes another kernel as an argument is compiled in each process. What they 
 `gradient` is half the gradient of the cost, ``J^T W r``.
 """
 
+import itertools
 import math
 
 import numpy as np
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.jit import kernel
+
+
+def first_indices(**sizes: int) -> dict[str, int]:
+    """Index of the first entry of each named part of a vector, and of its `end`.
+
+    >>> first_indices(position=3, angle=1)
+    {'position': 0, 'angle': 3, 'end': 4}
+    """
+    first = dict.fromkeys((*sizes, 'end'), 0)
+    for before, name in itertools.pairwise(list(first)):
+        first[name] = first[before] + sizes[before]
+    return first
+
 
 # -- One matrix -----------------------------------------------------------------------------------
 

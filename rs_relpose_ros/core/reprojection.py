@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.core.deviations import slices
+from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
@@ -56,50 +56,46 @@ MOST_ACCELERATIONS = 3
 # First row of each value of an observation in its block: the unit ray in the axes of the frame's
 # reference row, the derivatives of both pixel coordinates by the ray [px], s [s], S(s) [m], and
 # the derivative of S by s [m/s].
-_OBSERVATION = slices({'ray': 3, 'to_pixels': 6, 'time': 1, 'moved': 3, 'moving': 3})
-RAY = _OBSERVATION['ray'].start
-TO_PIXELS = _OBSERVATION['to_pixels'].start
-TIME = _OBSERVATION['time'].start
-MOVED = _OBSERVATION['moved'].start
-MOVING = _OBSERVATION['moving'].start
-VALUES = _OBSERVATION['moving'].stop
+_OBSERVATION = first_indices(ray=3, to_pixels=6, time=1, moved=3, moving=3)
+RAY = _OBSERVATION['ray']
+TO_PIXELS = _OBSERVATION['to_pixels']
+TIME = _OBSERVATION['time']
+MOVED = _OBSERVATION['moved']
+MOVING = _OBSERVATION['moving']
+VALUES = _OBSERVATION['end']
 
 # First row of each value of a track in its block: f, two vectors across the ray of frame 1, along
 # which f moves, and rho times the length of f.
-_TRACK = slices({'direction': 3, 'columns': 6, 'inverse_distance': 1})
-DIRECTION = _TRACK['direction'].start
-COLUMNS = _TRACK['columns'].start
-INVERSE_DISTANCE = _TRACK['inverse_distance'].start
-TRACK_VALUES = _TRACK['inverse_distance'].stop
+_TRACK = first_indices(direction=3, columns=6, inverse_distance=1)
+DIRECTION = _TRACK['direction']
+COLUMNS = _TRACK['columns']
+INVERSE_DISTANCE = _TRACK['inverse_distance']
+TRACK_VALUES = _TRACK['end']
 # Unknowns of a track: two steps of its direction, and its inverse distance.
 TRACK_UNKNOWNS = 3
 
 # First unknown of the path: two steps of t in its tangent plane, log k, b, and e_0, e_1, ...; the
 # phi of the frames 1, 2, ... follow after them.
-_UNKNOWNS = slices(
-    {'tangent': 2, 'log_scale': 1, 'bias': 3, 'acceleration': 3 * MOST_ACCELERATIONS}
-)
-TANGENT = _UNKNOWNS['tangent'].start
-LOG_SCALE = _UNKNOWNS['log_scale'].start
-BIAS = _UNKNOWNS['bias'].start
-ACCELERATION = _UNKNOWNS['acceleration'].start
+_UNKNOWNS = first_indices(tangent=2, log_scale=1, bias=3, acceleration=3 * MOST_ACCELERATIONS)
+TANGENT = _UNKNOWNS['tangent']
+LOG_SCALE = _UNKNOWNS['log_scale']
+BIAS = _UNKNOWNS['bias']
+ACCELERATION = _UNKNOWNS['acceleration']
 
 # First row of an observation's derivatives: by the unknowns of its track, the residual itself, by
 # phi of its frame, by the path, and by the place p(s).
-_ROWS = slices(
-    {
-        'track': TRACK_UNKNOWNS,
-        'residual': 1,
-        'phi': 3,
-        'path': _UNKNOWNS['acceleration'].stop,
-        'place': 3,
-    }
+_ROWS = first_indices(
+    track=TRACK_UNKNOWNS,
+    residual=1,
+    phi=3,
+    path=_UNKNOWNS['end'],
+    place=3,
 )
-RESIDUAL = _ROWS['residual'].start
-PHI = _ROWS['phi'].start
-PATH = _ROWS['path'].start
-PLACE = _ROWS['place'].start
-ROWS = _ROWS['place'].stop
+RESIDUAL = _ROWS['residual']
+PHI = _ROWS['phi']
+PATH = _ROWS['path']
+PLACE = _ROWS['place']
+ROWS = _ROWS['end']
 
 # Square of the sine of the parallax below which the distance of a track is not triangulated.
 # [chosen: 1e-4 rad, a tenth of a pixel; the adjustment finds the distance in any case]

@@ -410,7 +410,7 @@ def adjust(
     return Adjusted(
         state,
         noise,
-        _covariance(normal, state, priors, COMMON_SIGMA / sigma, tracks.number),
+        _covariance(normal, state, priors, (sigma / noise) ** 2, tracks.number),
         normal.squares > (_FARTHEST * sigma) ** 2,
     )
 
@@ -422,15 +422,16 @@ def _covariance(
     """Covariance (n, n) of the path, by the scatter of the tracks' gradients (sandwich).
 
     The errors of one track in consecutive frames are similar, the errors of the `count` tracks
-    are independent. `common`: sigma of the error that the residuals do not show, in units of the
-    sigma of an observation; its part of the scatter follows from the Hessian of the observations.
+    are independent. `common`: variance of an observation with the error that its residuals do not
+    show (`COMMON_SIGMA`), over the variance of the residuals.
     """
     n = len(normal.gradient)
-    information = np.zeros((n, n))
-    _add_priors(state, priors, information, np.zeros(n))
     # Few tracks scatter less than many: the fit has adapted to them.
     of_few = count / max(count - n / TRACK_UNKNOWNS, 1.0)
-    of_common = common * common * (normal.hessian - information)
-    scatter = of_few * normal.scatter + of_common + information
+    # The common error scales the noise, not the result: priors count as they are. [measured: 238
+    # simulated pairs: with the Hessian's part of the common error in place of the scatter's, 1.3 %
+    # of R beyond 3 sigma for 0.4 %, of t 0.4 % for 0; 117 pairs of recordings unchanged]
+    scatter = common * of_few * normal.scatter
+    _add_priors(state, priors, scatter, np.zeros(n))
     covariance = inverse(normal.hessian)
     return covariance @ scatter @ covariance

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_relpose_ros.core.deviations import slices
+from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
 from rs_relpose_ros.jit import kernel, small_kernel
@@ -32,14 +32,14 @@ from rs_relpose_ros.jit import kernel, small_kernel
 # First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
 # plane, and four vectors. The logarithm of the velocities' scale follows after them if it is
 # unknown, too.
-_UNKNOWNS = slices({'theta': 3, 'tangent': 2, 'd1': 3, 'd2': 3, 'dw1': 3, 'dw2': 3, 'scale': 1})
-THETA = _UNKNOWNS['theta'].start
-TANGENT = _UNKNOWNS['tangent'].start
-D1 = _UNKNOWNS['d1'].start
-D2 = _UNKNOWNS['d2'].start
-DW1 = _UNKNOWNS['dw1'].start
-DW2 = _UNKNOWNS['dw2'].start
-SCALE = _UNKNOWNS['scale'].start
+_UNKNOWNS = first_indices(theta=3, tangent=2, d1=3, d2=3, dw1=3, dw2=3, scale=1)
+THETA = _UNKNOWNS['theta']
+TANGENT = _UNKNOWNS['tangent']
+D1 = _UNKNOWNS['d1']
+D2 = _UNKNOWNS['d2']
+DW1 = _UNKNOWNS['dw1']
+DW2 = _UNKNOWNS['dw2']
+SCALE = _UNKNOWNS['scale']
 PARAMETERS = SCALE
 
 

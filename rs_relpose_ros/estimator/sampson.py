@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.core.epipolar import by_motion, residual, View
+from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.core.losses import Flags
 from rs_relpose_ros.core.triangulate import depths
 from rs_relpose_ros.estimator.priors import (
@@ -39,11 +39,11 @@ from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 BLOCK = 64
 # First numbers of an observation: the vectors of both views, and the two row times. A block has
 # the root of the weight behind them.
-_PARTS = slices({'view_1': 9, 'view_2': 9, 'times': 2})
-VIEW_1 = _PARTS['view_1'].start
-VIEW_2 = _PARTS['view_2'].start
-TIMES = _PARTS['times'].start
-OBSERVATION = _PARTS['times'].stop
+_PARTS = first_indices(view_1=9, view_2=9, times=2)
+VIEW_1 = _PARTS['view_1']
+VIEW_2 = _PARTS['view_2']
+TIMES = _PARTS['times']
+OBSERVATION = _PARTS['end']
 ROOT = OBSERVATION
 
 
