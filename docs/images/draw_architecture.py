@@ -46,11 +46,12 @@ PAIR = (
     ('message, CSV, graph', 'messages/outgoing.py'),
 )
 COVARIANCE = (
-    ('noise of gyro and accelerometer', 'imu/integration.py'),
+    ('noise of gyro, accelerometer', 'imu/integration.py'),
     ('noise of the matches', 'core/losses.py'),
     ('weights of the fit', 'estimator/fit.py'),
-    ('scatter of groups of residuals', 'core/least_squares.py'),
-    ('covariance of the pose', 'estimator/covariance.py'),
+    ('scatter of groups', 'core/least_squares.py'),
+    ('covariance of the optimum', 'estimator/covariance.py'),
+    ('frames between replace it', 'estimator/frames_between.py'),
     ('+ doubt of the calibration', 'pipeline/monitor.py'),
     ('published', 'messages/outgoing.py'),
 )

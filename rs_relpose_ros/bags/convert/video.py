@@ -183,7 +183,7 @@ _READOUTS = (
 )
 # A .gcsv has the direction separately; of its four values these are rows upwards, and columns.
 _UPWARDS = ('1', '180', 'BottomToTop')
-# Values of columns that are read one by one, which are refused.
+# Values that mean columns read one by one: no readout time is taken from them.
 _COLUMNS = ('2', '270', 'LeftToRight', '3', '90', 'RightToLeft')
 
 # Group and tag of stabilisation, its values without it, its name, and the switch of the camera.
