@@ -8,12 +8,14 @@ from bag_kinds import IMAGE, INFO
 from conftest import BUNDLED_PARAMETERS
 import numpy as np
 import pytest
+from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags import storage
 from rs_relpose_ros.bags.order import clock_runs, reading_order
 from rs_relpose_ros.bags.reader import open_bag, RawMessage
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.offline.replay import Replay
 
 MS = 1_000_000
@@ -172,6 +174,19 @@ def expected(ordered: Path) -> list[object]:
 def test_poses_do_not_depend_on_the_order_of_the_file(ordered, expected, tmp_path, key):
     assert len(expected) >= 3
     assert poses_of(rewritten(ordered, tmp_path / 'bag', key)) == expected
+
+
+def test_messages_in_the_other_byte_order_have_their_stamps(tmp_path):
+    big = get_typestore(Stores.ROS2_JAZZY)
+
+    def serialize(message: object, msgtype: str) -> bytes:
+        return bytes(big.serialize_cdr(message, msgtype, little_endian=False))
+
+    messages = [bag_kinds.imu(t, (0.1, 0.2, 0.3)) for t in (5, 3, 1)]
+    bag = bag_kinds.write_kind('mcap', tmp_path, messages, serialize)
+    with open_bag(bag) as opened:
+        read = [stamp_ns(m.message.header) for m in opened.messages(opened.topics, by_stamp=True)]
+    assert [stamp - bag_kinds.STAMP_NS for stamp in read] == [1, 3, 5]
 
 
 def test_chunks_are_kept_within_a_bound(monkeypatch):

@@ -389,15 +389,16 @@ class Bag:
     def _whole_index(self) -> _Index:
         """Places of all messages, which the first reading collects."""
         columns = [array('q') for _ in _Index._fields]
-        stored = list(self._stored.values())
-        has_header = [_begins_with_header(topic) for topic in stored]
         for number, opened in enumerate(self._storages):
-            keys = {topic.id: self._numbers[topic.name, topic.msgtype] for topic in opened.topics}
-            entries = self._guarded(number, opened.entries())
-            for topic_id, received, place, offset, data in entries:
-                topic = keys[topic_id]
-                stamp = _stamp_of(data) if has_header[topic] else received
-                row = topic, number, place, offset, received, stamp
+            topics = {topic.id: topic for topic in opened.topics}
+            has_header = {topic.id: _begins_with_header(topic) for topic in opened.topics}
+            for entry in self._guarded(number, opened.entries()):
+                topic = topics[entry.topic_id]
+                stamp = entry.time_ns
+                if has_header[topic.id]:
+                    stamp = _stamp_of(entry.data, topic.encoding)
+                key = self._numbers[topic.name, topic.msgtype]
+                row = key, number, entry.place, entry.offset, entry.time_ns, stamp
                 for column, value in zip(columns, row, strict=True):
                     column.append(value)
         return _Index(*(np.frombuffer(column, np.int64) for column in columns))
@@ -486,6 +487,8 @@ _MEASURED = (IMAGE, COMPRESSED_IMAGE, IMU)
 _BEFORE_STAMP = 4
 # Stamp of a header: seconds and nanoseconds.
 _STAMP = struct.Struct('<iI')
+# The same in the other byte order, which the second byte of CDR names.
+_BIG_STAMP = struct.Struct('>iI')
 
 
 def _begins_with_header(topic: StoredTopic) -> bool:
@@ -494,13 +497,15 @@ def _begins_with_header(topic: StoredTopic) -> bool:
     return bool(fields) and 'std_msgs/msg/Header' in str(fields[0])
 
 
-def _stamp_of(data: bytes | memoryview) -> int:
+def _stamp_of(data: bytes | memoryview, encoding: str) -> int:
     """Stamp [ns] of the header that a message begins with; 0 where it is too short for one."""
     if data[:4] == storage.ZSTD_MAGIC:
-        data = storage.first_bytes(data, _BEFORE_STAMP + 8)
-    if len(data) < _BEFORE_STAMP + 8:
+        data = storage.first_bytes(data, _BEFORE_STAMP + _STAMP.size)
+    if len(data) < _BEFORE_STAMP + _STAMP.size:
         return 0
-    seconds, nanoseconds = _STAMP.unpack_from(data, _BEFORE_STAMP)
+    is_big_endian = encoding == 'cdr' and not data[1] & 1
+    layout = _BIG_STAMP if is_big_endian else _STAMP
+    seconds, nanoseconds = layout.unpack_from(data, _BEFORE_STAMP)
     return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
