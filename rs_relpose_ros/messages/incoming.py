@@ -22,6 +22,7 @@ from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.camera_info import intrinsics_from_info
+from rs_relpose_ros.messages.streams import check_timelines, Stream
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
@@ -52,7 +53,12 @@ def time_ns(stamp: Any) -> int:
 
 
 def _nanoseconds(seconds: int, nanoseconds: int) -> int:
-    if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS:
+    if nanoseconds >= NANOSECONDS:
+        raise InputError(
+            f'stamp is out of range: {seconds} s and {nanoseconds} ns, nanosec must be below '
+            '1000000000'
+        )
+    if seconds < 0 or nanoseconds < 0:
         raise InputError(f'stamp is out of range: {seconds} s and {nanoseconds} ns')
     return seconds * NANOSECONDS + nanoseconds
 
@@ -182,15 +188,30 @@ SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
 
 
 def sensor_messages(
-    bag: Any, topics: Any, roles: Collection[Role] = SENSOR_ROLES
+    bag: Any, topics: Any, roles: Collection[Role] = SENSOR_ROLES, *, faulty: bool = False
 ) -> Iterator[tuple[Role, Any]]:
-    """Messages of a `Bag` with one of the roles, by stamp; `topics`: `SensorTopics`."""
+    """Messages of a `Bag` with one of the roles, by stamp; `topics`: `SensorTopics`.
+
+    InputError if a topic has several publishers or impossible stamps and, unless they may be
+    `faulty`, if a fault of the streams permits no pose.
+    """
     found = {
         topic.name: (role, topic)
         for role in reversed(Role)
         if role in roles and (topic := getattr(topics, role.value)) is not None
     }
+    if not faulty and Role.IMU in roles and Role.IMAGE in roles:
+        for fault in check_timelines(bag.timeline, topics):
+            if fault.withholds:
+                raise InputError(f'{bag.path}: {fault}')
+    streams = {
+        name: Stream(name, has_gyro=role is Role.IMU)
+        for name, (role, _) in found.items()
+        if role is not Role.TRUTH
+    }
     for message in bag.messages([topic for _, topic in found.values()], by_stamp=True):
+        if message.topic in streams:
+            streams[message.topic].add(message.message)
         yield found[message.topic][0], message
 
 
@@ -314,6 +335,7 @@ class Intake:
         self._configured = configured if configured is not None and configured.given else None
         self._held: list[images.EncodedImage] = []  # wait for the first CameraInfo
         self._last: images.EncodedImage | None = None
+        self._streams: dict[Role, Stream] = {}
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
 
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
@@ -322,8 +344,11 @@ class Intake:
         if role is Role.CAMERA_INFO and self._configured is not None:
             return None
         try:
+            self._stream(role).add(message)
             data = PARTS[role].read(message)
             if role is Role.IMAGE:
+                if Role.IMU in self._streams and self._streams[Role.IMU].fault:
+                    raise InputError(self._streams[Role.IMU].fault)
                 self._add_image(data)
             elif role is Role.CAMERA_INFO:
                 self._use(data)
@@ -338,6 +363,11 @@ class Intake:
                 self._use(None, str(error))
             return error
         return None
+
+    def _stream(self, role: Role) -> Stream:
+        if role not in self._streams:
+            self._streams[role] = Stream(f'topic {role.value}', has_gyro=role is Role.IMU)
+        return self._streams[role]
 
     def waits_for_imu(self) -> bool:
         """Whether a frame needs samples that have not been received yet."""

@@ -19,6 +19,13 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import ForceFault, length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
+from rs_relpose_ros.messages.streams import (
+    check_timelines,
+    counter_unit,
+    Kind,
+    StreamFault,
+    true_rate,
+)
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
@@ -151,7 +158,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     scan = Scan(images, parameters.intrinsics)
     completion, sample, topics = Completion(parameters), None, None
-    source = scan.added(sensor_messages(bag, chosen))
+    source = scan.added(sensor_messages(bag, chosen, faulty=True))
     if chosen.image is not None and chosen.imu is not None:
         topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
         completion = check_recording.completed(bag, topics, parameters)
@@ -178,15 +185,16 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
             _calibration(scan),
             _transport(scan, chosen.image, bag.reliability(chosen.image)),
         ]
+    faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
     if chosen.imu is not None:
-        findings += _imu(scan, bag.reliability(chosen.imu), parameters)
+        findings += _imu(scan, bag.reliability(chosen.imu), parameters, faults)
     if topics is not None:
         if sample is not None and sample.is_lost and completion.found is None:
             with suppress(InputError):  # the recording permits no calibration
                 completion = completion._replace(
                     found=check_recording.calibrated(bag, topics, completion.parameters)
                 )
-        findings += joint_findings(scan, sample, completion, parameters)
+        findings += joint_findings(scan, sample, completion, parameters, faults)
     return CheckReport(str(bag.path), tuple(findings))
 
 
@@ -276,6 +284,7 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
     text, unordered = f'jitter {1e3 * jitter:.2f} ms', repeated + backwards
     if unordered:
         text += f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} s)'
+    unit = counter_unit(furthest_back, stamps.interval) if furthest_back > 0.0 else ''
     return by_case(
         name,
         text,
@@ -284,6 +293,12 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
             unordered > _UNORDERED_SHARE * stamps.count,
             WRONG,
             f'have the driver of {of} stamp each message with its own time',
+        ),
+        Case(
+            bool(unit),
+            SUSPECT,
+            'stamps go on in the right order; have the driver extend its counter to 64 bits',
+            f': a 32-bit counter of {unit} overflowed',
         ),
         Case(
             furthest_back > 1.0,
@@ -487,7 +502,9 @@ _MOST_FORCE = 10.8
 _FASTEST_MEDIAN = 8.0
 
 
-def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Line]:
+def _imu(
+    scan: Scan, reliability: str, parameters: Parameters, faults: Mapping[Kind, StreamFault]
+) -> list[Line]:
     """Findings on the IMU by itself."""
     if not len(scan.rates):
         problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
@@ -501,13 +518,23 @@ def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Line]:
             )
         ]
     stamps = scan.stamps(Role.IMU)
+    rate = _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap)
+    if Kind.BURSTS in faults:
+        rate = _of_fault(Code.IMU_RATE, WRONG, faults[Kind.BURSTS])
+    lines = [rate, stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU')]
+    if Kind.ACCEL_CLOCK in faults:
+        lines.append(_of_fault(Code.ACCEL_CLOCK, SUSPECT, faults[Kind.ACCEL_CLOCK]))
     return [
-        _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap),
-        stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU'),
+        *lines,
         _gyro(scan),
         _bias(scan, parameters),
         _accelerometer(scan),
     ]
+
+
+def _of_fault(code: Code, state: FindingState, fault: StreamFault) -> Line:
+    """Line on a fault of a stream."""
+    return property_line(code, state, fault.message, fault.fix, fault.measured)
 
 
 def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
@@ -517,6 +544,7 @@ def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
     gaps = int((stamps.forwards > gap).sum())
     hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
     recorded = f', recorded as {reliability}' if reliability else ''
+    true, how = true_rate(hertz, scan.rates) or (hertz, '')
     return by_case(
         Code.IMU_RATE,
         f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
@@ -528,7 +556,15 @@ def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
             'longest_step_s': stamps.longest,
             'unusable': unusable,
             'reliability': reliability or None,
+            'true_rate_hz': true,
         },
+        Case(
+            bool(how),
+            SUSPECT,
+            'have the driver publish each sample of the sensor once: noise and lag are those of '
+            'the true rate',
+            f'; values are {how}, the true rate of the gyro is {true:.0f} Hz',
+        ),
         Case(
             stamps.interval > gap,
             WRONG,
@@ -649,6 +685,8 @@ def _accelerometer(scan: Scan) -> Line:
 # Smaller would report slow drivers, larger would miss an offset that loses frames.
 # [chosen: 0.2 to 1 s would do]
 _SAME_CLOCK = 0.5
+# Largest legal value of the parameter time_offset [s]. [derived: its declaration]
+_LARGEST_OFFSET = 10.0
 # Matches of a pair in the median below which there is no estimate, and below which they are few.
 # [chosen: a solver samples 9 or 11 matches, and an inlier ratio is never 1]
 _NO_MATCHES = 15
@@ -674,15 +712,26 @@ _SET_BY = {'quat_cam_imu_xyzw': Code.AXES, 'readout_time': Code.READOUT_TIME}
 
 
 def joint_findings(
-    scan: Scan, sample: Sample | None, completion: Completion, parameters: Parameters
+    scan: Scan,
+    sample: Sample | None,
+    completion: Completion,
+    parameters: Parameters,
+    faults: Mapping[Kind, StreamFault],
 ) -> list[Line]:
     """Findings on both sensors together.
 
     `sample` is None if `completion` could not find missing `parameters`.
     """
     health = Assessment(()) if sample is None else _with_calibration(sample, scan, completion)
-    found = [_overlap(scan, parameters)]
-    if sample is not None:
+    has_poses = sample is not None and sample.poses > 0 and health.state is not WRONG
+    found = [_overlap(scan, parameters, has_poses)]
+    if Kind.SINCE_BOOT in faults:
+        found = [_of_fault(Code.CLOCKS, WRONG, faults[Kind.SINCE_BOOT])]
+    cause = next((fault for fault in faults.values() if fault.withholds), None)
+    if sample is not None and cause is not None:
+        message = f'not measured: {cause.message}'
+        found.append(property_line(Code.PAIRS, UNKNOWN, message, '', {}))
+    elif sample is not None:
         found += [_pairs(sample, health), _texture(sample, health)]
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
@@ -692,8 +741,11 @@ def joint_findings(
     return found if effect is None else [*found, effect]
 
 
-def _overlap(scan: Scan, parameters: Parameters) -> Line:
-    """Whether the gyro covers the images in time, as stamped."""
+def _overlap(scan: Scan, parameters: Parameters, has_poses: bool) -> Line:
+    """Whether the gyro covers the images in time, as stamped.
+
+    If there are poses the stamps are right, and a difference of the delays is that of delivery.
+    """
     name, images, imu = Code.CLOCKS, scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
     if not images.count or not imu.count:
         return property_line(name, WRONG, 'no stamps to compare', 'correct the topics above', {})
@@ -701,17 +753,15 @@ def _overlap(scan: Scan, parameters: Parameters) -> Line:
     common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
     apart = images.delay - imu.delay
     measured = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
-    if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
-        _SAME_CLOCK, 0.5 * images.duration
-    ):
-        return property_line(
-            name,
-            WRONG,
-            f'images and IMU are stamped {abs(apart):.3f} s apart',
-            'use one clock for both drivers (ROS time, not time since boot), or set '
-            f'time_offset: {apart:.3f} if the difference is constant',
-            measured,
-        )
+    apart_too_far = max(_SAME_CLOCK, 0.5 * images.duration)
+    is_apart = abs(apart + parameters.sensor.time_offset) > apart_too_far
+    if common <= 0.0 or (is_apart and not has_poses):
+        fix = 'use one clock for both drivers (ROS time, not time since boot)'
+        if abs(apart) <= _LARGEST_OFFSET:
+            fix += f', or set time_offset: {apart:.3f} if the difference is constant'
+        message = f'images and IMU are stamped {abs(apart):.3f} s apart'
+        return property_line(name, WRONG, message, fix, measured)
+    history = parameters.imu.imu_buffer_seconds
     return by_case(
         name,
         f'{common:.1f} s in common; recorded {1e3 * images.delay:.0f} ms (images) and '
@@ -721,6 +771,12 @@ def _overlap(scan: Scan, parameters: Parameters) -> Line:
             common < 0.8 * images.duration,
             SUSPECT,
             "images outside of the IMU's time are refused: start the IMU first and stop it last",
+        ),
+        Case(
+            has_poses and apart > history,
+            SUSPECT,
+            f'{apart:.1f} s of delivery are more than the {history:g} s of IMU that a node keeps '
+            '(imu_buffer_seconds): live, these images have no pose; offline the stamps decide',
         ),
         Case(
             abs(apart) > _SAME_CLOCK,

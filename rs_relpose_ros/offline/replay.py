@@ -25,6 +25,7 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.outgoing import pair_parts, PAIR_TOPICS
+from rs_relpose_ros.messages.streams import check_timelines
 from rs_relpose_ros.offline import tables
 from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -128,6 +129,9 @@ class Replay:
         """Run over the bag, and yield every pair; `last_ns` is then its bag time."""
         warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
+        for fault in check_timelines(self._bag.timeline, self._topics):
+            if not fault.withholds:
+                _logger.warning('%s', fault)
         for outcome in outcomes(self._front_end, self.intake, self._messages()):
             if isinstance(outcome, Frame):
                 self.processing_seconds += outcome.seconds

@@ -72,6 +72,7 @@ class Code(str, Enum):
     GYRO_AT_REST = 'gyro at rest'
     GRAVITY = 'gravity'
     CLOCKS = 'clocks'
+    ACCEL_CLOCK = 'accelerometer clock'
     PAIRS = 'pairs'
     TEXTURE = 'texture'
     ROLLING_SHUTTER = 'rolling shutter'

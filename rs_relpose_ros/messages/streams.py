@@ -1,0 +1,286 @@
+"""What is wrong with the stamps and the publishers of a stream, for check, replay and the nodes.
+
+Offline the stamps of the whole stream are known before its messages (`stream_faults`); a node
+knows the last ones (`Stream`). Both use the same rules:
+
+| fault | rule |
+|---|---|
+| bursts | most steps are far shorter than the mean one: stamps are times of arrival |
+| two publishers | the frame_id changes to and fro |
+| nanosec above 999999999 | most stamps have it: a cast from 64 to 32 bits |
+| time since boot | one clock starts before 2001, the other one after |
+| clock of the accelerometer | its delay to the recorder differs from that of the gyro |
+| 32-bit counter | a step back of 2^32 units |
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+Stamps = NDArray[np.int64]
+
+# A step shorter than this share of the mean one is within a burst. [chosen: jitter of a
+# millisecond at 200 Hz makes steps of 0.6; samples read at once are stamped within a tenth]
+_WITHIN_BURST = 0.25
+# Share of such steps that makes bursts: (n - 1) / n of bursts of n samples. [chosen: 0.7 are
+# bursts of 3.4 samples; pairs of gyro and accelerometer on one topic make 0.5]
+_IN_BURSTS = 0.7
+# Fewer steps are no evidence. [chosen: any value from 20 to 100 would do]
+_FEWEST_STEPS = 40
+# Longer steps are gaps and steps of a clock, not the time between bursts [ns]. [chosen: any value
+# from 0.5 s to 5 s would do]
+_GAP_NS = NANOSECONDS
+# Stamps before this time are since the start of a device, those after it since 1970 [ns].
+# [derived: 10^9 s are 2001, and 31 years of running]
+_SINCE_1970_NS = 10**9 * NANOSECONDS
+# Two sensors of one driver that reach the recorder with delays that differ by more have clocks of
+# their own [s]. [chosen: batches of an IMU are late by 0.1 s; any value from 0.3 to 1 would do]
+_OWN_CLOCK = 0.5
+# A step back is that of a 32-bit counter if it differs by less from 2^32 units, in steps of the
+# stream. [chosen: some messages may be lost there; any value from 5 to 100 would do]
+_LOST_AT_WRAP = 20.0
+# Units of counters of 32 bits, by the seconds of one unit.
+_UNITS = {'nanoseconds': 1e-9, 'microseconds': 1e-6, 'milliseconds': 1e-3}
+# The publisher of a topic has changed to and fro so often if there are two. [chosen: a restarted
+# driver or two joined recordings change it once]
+_RETURNS = 2
+# Most of so many stamps must be impossible: a single one is a damaged message. [chosen: any value
+# from 3 to 20 would do]
+_FEWEST_STAMPS = 5
+# A node looks at so many stamps of a stream. [chosen: bursts of 100 need 300; any value from 300
+# to 2000 would do]
+_WINDOW = 512
+# It looks at them again after so many. [chosen: it costs 0.1 ms; 16 to 256 would do]
+_EVERY = 64
+
+
+class Kind(str, Enum):
+    """Kind of a fault of a stream."""
+
+    BURSTS = 'bursts'
+    SINCE_BOOT = 'since_boot'
+    ACCEL_CLOCK = 'accel_clock'
+
+
+class StreamFault(NamedTuple):
+    """A fault of a stream, with a text and what to do."""
+
+    kind: Kind
+    message: str
+    fix: str
+    measured: Mapping[str, Any]
+
+    @property
+    def withholds(self) -> bool:
+        """Whether no pose can be right."""
+        return self.kind is not Kind.ACCEL_CLOCK
+
+    def __str__(self) -> str:
+        return f'{self.message}; {self.fix}'
+
+
+class Timeline(NamedTuple):
+    """Stamps and times of reception [ns] of the messages of a topic."""
+
+    topic: str
+    stamps: Stamps
+    received: Stamps
+
+    @property
+    def delay(self) -> float:
+        """Median time from the stamp to the reception [s]."""
+        return float(np.median(self.received - self.stamps)) / NANOSECONDS
+
+
+class Bursts(NamedTuple):
+    """Samples that are stamped as they arrive, many at once."""
+
+    size: int
+    rate: float  # of the sensor [Hz]
+
+
+def find_bursts(stamps: Stamps) -> Bursts | None:
+    """Return the bursts of stamps (N,) [ns] in the order of their coming; None without bursts."""
+    steps = np.diff(stamps)
+    steps = steps[(steps >= 0) & (steps < _GAP_NS)]
+    if len(steps) < _FEWEST_STEPS or not steps.any():
+        return None
+    mean_ns = float(steps.mean())
+    within = steps < _WITHIN_BURST * mean_ns
+    starts = np.flatnonzero(~within)  # the last samples of bursts
+    if within.mean() < _IN_BURSTS or len(starts) < 3:
+        return None
+    size = float(np.median(np.diff(starts)))
+    ends_ns = np.cumsum(steps)[starts]
+    return Bursts(round(size), size * NANOSECONDS / float(np.median(np.diff(ends_ns))))
+
+
+def burst_fault(topic: str, bursts: Bursts) -> StreamFault:
+    """Make the fault of a gyro in bursts."""
+    return StreamFault(
+        Kind.BURSTS,
+        f'the samples of {topic} come in bursts of {bursts.size} that are stamped on arrival, '
+        f'their true rate is {bursts.rate:.0f} Hz',
+        'have the driver stamp each sample with the time of the sensor',
+        {'burst': bursts.size, 'rate_hz': bursts.rate},
+    )
+
+
+def counter_unit(step: float, interval: float) -> str:
+    """Return the unit of a 32-bit counter that overflowed at a step back [s]; '' if it is none."""
+    for unit, seconds in _UNITS.items():
+        if abs(abs(step) - 2**32 * seconds) <= _LOST_AT_WRAP * interval:
+            return unit
+    return ''
+
+
+def stream_faults(
+    image: Timeline | None, imu: Timeline | None, accel: Timeline | None
+) -> list[StreamFault]:
+    """Return the faults of the streams of a recording, by the stamps of all messages."""
+    faults = []
+    if imu is not None and (bursts := find_bursts(imu.stamps)) is not None:
+        faults.append(burst_fault(imu.topic, bursts))
+    if image is not None and imu is not None and len(image.stamps) and len(imu.stamps):
+        faults += _since_boot(image, imu)
+    if imu is not None and accel is not None and len(imu.stamps) and len(accel.stamps):
+        ahead = imu.delay - accel.delay
+        if abs(ahead) > _OWN_CLOCK:
+            faults.append(_accel_clock(accel.topic, ahead))
+    return faults
+
+
+def _since_boot(image: Timeline, imu: Timeline) -> list[StreamFault]:
+    image_ns, imu_ns = int(np.median(image.stamps)), int(np.median(imu.stamps))
+    if (image_ns < _SINCE_1970_NS) == (imu_ns < _SINCE_1970_NS):
+        return []
+    boot, epoch = ('images are', 'IMU') if image_ns < imu_ns else ('IMU is', 'images')
+    since = min(image_ns, imu_ns) / NANOSECONDS
+    message = (
+        f'the {boot} stamped with the time since boot ({since:.1f} s), '
+        f'the {epoch} with the time since 1970'
+    )
+    fix = 'have both drivers stamp with one clock (ROS time)'
+    return [StreamFault(Kind.SINCE_BOOT, message, fix, {'apart_s': (image_ns - imu_ns) * 1e-9})]
+
+
+def _accel_clock(topic: str, ahead: float) -> StreamFault:
+    side = 'ahead of' if ahead > 0.0 else 'behind'
+    return StreamFault(
+        Kind.ACCEL_CLOCK,
+        f'the clock of the accelerometer ({topic}) is {abs(ahead):.1f} s {side} that of the gyro',
+        'have its driver stamp both sensors with one clock; until then poses are from the gyro '
+        'alone',
+        {'ahead_s': ahead},
+    )
+
+
+# -- Repeated and interpolated samples ------------------------------------------------------------
+
+# A value that lies on the line between its neighbours within this share of the noise has been
+# interpolated. [chosen: of float32 and five digits; any value from 0.01 to 0.1 would do]
+_ON_LINE = 0.03
+# Largest factor between the rate of the messages and that of the sensor that is looked for.
+# [chosen: drivers that publish at 1 kHz read sensors of 100 Hz and more]
+_LARGEST_FACTOR = 8
+# Share of the values that must repeat, or lie on lines. [chosen: any value from 0.6 to 0.95]
+_MOST = 0.9
+
+
+def true_rate(rate: float, values: Array) -> tuple[float, str] | None:
+    """Return the rate [Hz] of the sensor behind values (N, 3), and how they were multiplied.
+
+    None if each message has a sample of its own. `rate` is that of the messages.
+    """
+    if len(values) < _FEWEST_STEPS or not np.ptp(values, axis=0).any():
+        return None
+    steps = np.diff(values, axis=0)
+    repeated: NDArray[np.bool_] = np.all(steps == 0.0, axis=1)
+    bends = np.abs(np.diff(steps, axis=0)).max(axis=1)
+    typical = float(np.quantile(bends, _MOST))
+    on_line: NDArray[np.bool_] = np.asarray(bends < _ON_LINE * typical)
+    for how, multiplied in (('repeated', repeated), ('interpolated', on_line)):
+        new = len(multiplied) - int(multiplied.sum())
+        factor = len(multiplied) / max(new, 1)
+        if 1.5 <= factor <= _LARGEST_FACTOR and _is_regular(multiplied, round(factor)):
+            return rate / factor, how
+    return None
+
+
+def _is_regular(multiplied: NDArray[np.bool_], factor: int) -> bool:
+    """Tell whether one of `factor` values is new, in a regular order."""
+    places = np.flatnonzero(~multiplied)
+    return len(places) > 2 and float(np.mean(np.diff(places) == factor)) > _MOST
+
+
+# -- Publishers and stamps, message by message ----------------------------------------------------
+
+
+class Stream:
+    """The messages of one topic as they come: publishers, stamps, bursts of a gyro.
+
+    `fault` is why poses are withheld; empty if nothing is wrong.
+    """
+
+    def __init__(self, topic: str, *, has_gyro: bool) -> None:
+        self.topic = topic
+        self.fault = ''
+        self._has_gyro = has_gyro
+        self._frame_id: str | None = None
+        self._others: list[str] = []  # frame_ids in the order of their first coming
+        self._returns = self._count = self._impossible = 0
+        self._stamps: deque[int] = deque(maxlen=_WINDOW)
+
+    def add(self, message: Any) -> None:
+        """Add the next message; InputError if the stream has two publishers or no stamps."""
+        header = message.header
+        if self._has_gyro and message.angular_velocity_covariance[0] == -1.0:
+            return  # of the accelerometer of a driver that publishes both on one topic
+        self._count_publishers(str(header.frame_id))
+        self._count_stamps(header.stamp)
+        if self._has_gyro:
+            self._stamps.append(int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec))
+            if self._count % _EVERY == 0:
+                bursts = find_bursts(np.array(self._stamps))
+                self.fault = '' if bursts is None else str(burst_fault(self.topic, bursts))
+
+    def _count_publishers(self, frame_id: str) -> None:
+        if frame_id == self._frame_id:
+            return
+        if frame_id in self._others:
+            self._returns += 1
+        else:
+            self._others.append(frame_id)
+        self._frame_id = frame_id
+        if self._returns >= _RETURNS:
+            names = ' and '.join(repr(one) for one in self._others[:4])
+            raise InputError(
+                f'{self.topic} has several publishers: its messages come with the frame_id '
+                f'{names} in turn; give each driver a topic of its own (remap)'
+            )
+
+    def _count_stamps(self, stamp: Any) -> None:
+        self._count += 1
+        self._impossible += int(stamp.nanosec) >= NANOSECONDS
+        if self._impossible >= _FEWEST_STAMPS and 2 * self._impossible > self._count:
+            raise InputError(
+                f'{self.topic}: nanosec of the stamps is above 999999999 ({int(stamp.nanosec)}): '
+                'the driver cast a time of 64 bits to 32; correct its stamps'
+            )
+
+
+def check_timelines(timeline: Callable[[Any], Any], topics: Any) -> list[StreamFault]:
+    """Return the faults of the streams of a bag; `timeline` of it, `topics` by role or None."""
+
+    def of(topic: Any) -> Timeline | None:
+        return None if topic is None else Timeline(topic.name, *timeline(topic))
+
+    return stream_faults(of(topics.image), of(topics.imu), of(topics.accel))
