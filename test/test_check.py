@@ -255,7 +255,7 @@ BROKEN = {
         imu_stamps(lambda t: t - START + 7 * MS, recorded=lambda self, stamp, k: stamp + START),
         'clocks',
         F,
-        'time_offset: ',
+        'stamp with one clock',
     ),
     'imu ends early': (
         imu_stamps(lambda t: t[:400]),
