@@ -211,7 +211,7 @@ def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows(
             expected = expected * step
         angles += np.linalg.norm(rates[k]) * dt
         rotation, _ = integration.integrate_rotation(stamps[: k + 2], rates[: k + 2], 0.0, 0.0)
-        np.testing.assert_allclose(motion.knot_rotations[k + 1], rotation, atol=1e-12)
+        np.testing.assert_allclose(motion.path.rotations[k + 1], rotation, atol=1e-12)
     # Fourth order; without the term w_0 x w_1 it is 4e-4.
     assert (Rotation.from_matrix(rotation).inv() * expected).magnitude() < 1e-6 * angles
 

@@ -14,15 +14,19 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
-from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.deviations import LENS, LIVE, N_DEVIATIONS, PARTS
+from rs_relpose_ros.core.rows import row_states, RowStates
+from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.arguments import estimate_relative_pose
+from rs_relpose_ros.estimator.priors import TwoViewState
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.imu import integration
 from rs_relpose_ros.imu.buffer import force_fault
-from rs_relpose_ros.imu.integration import integrate_rotation, rotation_sensitivity
+from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
@@ -142,7 +146,6 @@ def pair_data(start, end, c, camera=CAMERA):
         stamps_ns, rates = gyro(stamp + earliest - 1e-3, stamp + latest + 1e-3, c)
         motions.append(FrameMotion.from_gyro(1e-9 * stamps_ns - stamp, rates))
     stamps_ns, rates = gyro(start, end, c)
-    rotation, covariance = integrate_rotation(stamps_ns, rates, GYRO_NOISE, 3e-3)
     first, second = (ORIENTATION(stamp + c[OFFSET]) for stamp in (start, end))
     t = first.inv().apply(VELOCITY)
     return PairData(
@@ -153,9 +156,6 @@ def pair_data(start, end, c, camera=CAMERA):
         end - start,
         (first.inv() * second).as_matrix(),
         t / np.linalg.norm(t),
-        rotation,
-        covariance,
-        rotation_sensitivity(stamps_ns, rates, GYRO_NOISE),
         integration.ImuSlice(stamps_ns, rates, np.zeros(3), 3e-3, GYRO_NOISE),
         R_CAM_IMU.as_matrix(),
         0.01,
@@ -200,6 +200,41 @@ def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
     np.testing.assert_allclose(solved(pairs, 0.5 * c, 0.5 * c) - 0.5 * c, first, rtol=1e-9)
 
 
+@pytest.mark.parametrize('image', [0, 1])
+def test_derivatives_of_the_residuals_are_those_of_finite_differences(image):
+    """By deviations that turn the views of an image or delay its rows, and by the lens."""
+    pair = pair_data(0.4, 0.7, SMALL)
+    basis = np.eye(N_DEVIATIONS)
+    state = TwoViewState(
+        pair.R, pair.t, *(pair.t / 0.3 + RNG.normal(size=(2, 3))), *RNG.normal(size=(2, 3)) / 50
+    )
+
+    def frames(camera=pair.camera, at=basis[0] * 0.0):
+        moved = replace(pair, camera=camera)
+        problem = recursion.problem_of(moved)
+        return [recursion.frame_rows(moved, problem, k, at * (k == image)) for k in (0, 1)]
+
+    def residuals(rows):
+        vectors = [one.views.reshape(-1, 9) for one in rows]
+        return sampson.residuals(np.column_stack([*vectors, *(one.times for one in rows)]), state)
+
+    here = frames()
+    still = here[1 - image]
+    unmoved = RowStates(*(0.0 * values for values in still.states))
+    here[1 - image] = still._replace(states=unmoved)
+    value, analytic = recursion.residuals_by_deviation(state, here)
+    np.testing.assert_allclose(value, residuals(here), atol=1e-12)
+    for k in range(N_DEVIATIONS):
+        step = 1e-4 if k in range(N_DEVIATIONS)[PARTS['principal_point']] else 1e-6  # px, others
+        c = step * basis[k]
+        ends = [frames(at=sign * c) for sign in (1, -1)]
+        if LENS.start <= k < LENS.stop:
+            ends = [frames(CAMERA.moved_lens(sign * c[LENS])) for sign in (1, -1)]
+        numeric = (residuals(ends[0]) - residuals(ends[1])) / (2 * step)
+        scale = np.abs(numeric).max()
+        np.testing.assert_allclose(analytic[:, k], numeric, atol=1e-6 * scale + 1e-8)
+
+
 @pytest.mark.parametrize('row', ['first', 'middle', 'last'])
 @pytest.mark.parametrize('k', [OFFSET, READOUT, FOCAL])
 def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
@@ -221,8 +256,8 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
             camera,
             pair.motion1,
             pair.motion2,
-            pair.gyro_rotation,
-            pair.gyro_covariance,
+            pair.segment.rotation,
+            pair.segment.covariance,
             pair.interval,
             EstimatorConfig(pixel_sigma=0.3),
         )
@@ -254,8 +289,8 @@ def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estima
                 camera,
                 pair.motion1,
                 pair.motion2,
-                pair.gyro_rotation,
-                pair.gyro_covariance,
+                pair.segment.rotation,
+                pair.segment.covariance,
                 pair.interval,
                 EstimatorConfig(pixel_sigma=0.3),
             )
@@ -289,7 +324,8 @@ def test_the_rotation_of_the_images_does_not_follow_the_gyro():
     """Half a degree of the gyro's rotation is observed, though it is a prior of the pose."""
     pair = pair_data(0.4, 0.7, NONE)
     turn = np.array([0.006, -0.004, 0.005])
-    off = replace(pair, gyro_rotation=Rotation.from_rotvec(-turn).as_matrix() @ pair.gyro_rotation)
+    rates = pair.segment.angular_velocities - turn / pair.segment.duration
+    off = replace(pair, segment=replace(pair.segment, angular_velocities=rates))
     estimated = pair_information(off, NONE, NONE).images_against_gyro
     np.testing.assert_allclose(estimated, turn, atol=1e-3)
     few = replace(pair, points1=pair.points1[:12], points2=pair.points2[:12])
@@ -301,7 +337,11 @@ def test_derivative_by_the_rates_by_finite_differences():
     stamps = np.arange(0, 500 * MS, 5 * MS)
     t = stamps[:, None] * 1e-9
     rates = np.array([1.5, 1.8, 1.2]) * np.sin(t * [3.1, 2.3, 4.7] + [0.3, 1.1, 2.0])
-    by_rate = rotation_sensitivity(stamps, rates, GYRO_NOISE).by_rate
+    path = GyroPath.integrated(1e-9 * stamps, rates)
+    whole = row_states(path, np.eye(3), path.times[-1:], np.zeros(1))
+    by_rate = -whole.by_deviation[0][:, PARTS['gyro_bias']]
+    _, covariance = integrate_rotation(stamps, rates, 0.0, 1.0)
+    np.testing.assert_allclose(by_rate @ by_rate.T, covariance, atol=1e-5)
     for axis in range(3):
         step = 1e-5 * np.eye(3)[axis]
         more, _ = integrate_rotation(stamps, rates + step, GYRO_NOISE, 0.0)
@@ -1083,8 +1123,8 @@ def estimated_pairs(c, count):
                 pair.camera,
                 pair.motion1,
                 pair.motion2,
-                pair.gyro_rotation,
-                pair.gyro_covariance,
+                pair.segment.rotation,
+                pair.segment.covariance,
                 pair.interval,
                 EstimatorConfig(),
             ),

@@ -335,7 +335,7 @@ def test_imu_stamps_are_counted_and_change_no_frame_elsewhere(order, repeated, l
         for ms in stamps_ms:
             sequencer.add_imu(sample(ms, gyro=(0.1, 0.5, 0.01 * ms)))
         add_frames(sequencer, 100)
-        knots.append(sequencer.take().imu.motion.knot_rotations)
+        knots.append(sequencer.take().imu.motion.path.rotations)
     counts = sequencer.counts()
     assert (counts.imu_repeated, counts.imu_late, counts.imu_gaps, counts.clock_jumps) == (
         repeated,
@@ -377,7 +377,7 @@ def test_interleaving_does_not_change_the_result(early, takes):
     for a, b in zip(items, expected, strict=True):
         assert a.stamp_ns == b.stamp_ns
         np.testing.assert_array_equal(a.imu.motion.gravity, b.imu.motion.gravity)
-        np.testing.assert_array_equal(a.imu.motion.knot_rotations, b.imu.motion.knot_rotations)
+        np.testing.assert_array_equal(a.imu.motion.path.rotations, b.imu.motion.path.rotations)
         if a.imu.since_previous is not None:
             np.testing.assert_array_equal(
                 a.imu.since_previous.angular_velocities, b.imu.since_previous.angular_velocities
@@ -464,7 +464,7 @@ def test_a_frame_of_a_longer_readout_waits_for_its_rows(live):
     ready = live.take()
     # The rows end at 69 ms as configured; the stamped one stays.
     assert since_start(ready.imu.reference_ns) == [50]
-    assert ready.imu.motion.knot_times[[0, -1]] == pytest.approx([-0.0045, 0.0235])
+    assert ready.imu.motion.path.times[[0, -1]] == pytest.approx([-0.0045, 0.0235])
 
 
 EVEN = START + 33_366_700 * np.arange(60)

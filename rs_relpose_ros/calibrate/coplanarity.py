@@ -21,105 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 
 from rs_relpose_ros.core import deviations
 from rs_relpose_ros.core.deviations import OFFLINE
 from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.geometry.gyro import GyroPath, knot_before, write_state
 from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
-
-# -- Orientation by the gyro at any time --------------------------------------------------------
-
-
-class GyroPath(NamedTuple):
-    """Integrated gyro with K knots: rates are linear between neighbouring knots."""
-
-    times: Array  # (K,) [s]
-    rates: Array  # (K, 3) without the bias [rad/s]
-    rotations: Array  # (K, 3, 3) R_start^T R_k, IMU frame
-    # (K, 3, 3) integral of the rotations over time [s]: a rate error db turns the rotation at knot
-    # k by ``turned_k db``, in the frame of the start.
-    turned: Array
-
-    @classmethod
-    def integrated(cls, times: Array, measured: Array, bias: Array) -> GyroPath:
-        """Integrate rates (K, 3) at times (K,) after subtracting a bias (3,)."""
-        rates = measured - bias
-        rotations = _integrated(times, rates)
-        return cls(
-            times, rates, rotations, cumulative_trapezoid(rotations, times, axis=0, initial=0.0)
-        )
-
-    def at(self, times: Array) -> Array:
-        """Rotations (N, 3, 3) at times (N,); extrapolated outside of the knots."""
-        return _evaluated(self, times)
-
-
-@kernel
-def _integrated(times: Array, rates: Array) -> Array:
-    """``R <- R Exp((w_0 + w_1) dt / 2)``."""
-    rotations = np.empty((len(times), 3, 3))
-    rotations[0] = np.eye(3)
-    for k in range(len(times) - 1):
-        _path_rotation(
-            rotations[k], rates[k], rates[k + 1], times[k + 1] - times[k], rotations[k + 1]
-        )
-    return rotations
-
-
-@inlined_kernel
-def _path_rotation(rotation: Array, rate1: Array, rate2: Array, dt: float, out: Array) -> None:
-    """Write ``R Exp(phi)`` with ``phi = (w_1 + w_2) dt / 2``: Rodrigues' formula for each row."""
-    phi = (
-        0.5 * dt * (rate1[0] + rate2[0]),
-        0.5 * dt * (rate1[1] + rate2[1]),
-        0.5 * dt * (rate1[2] + rate2[2]),
-    )
-    square = dot(phi, phi)
-    if square < 0.01:  # to 1e-14; without sine and cosine twice as fast
-        a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
-        b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
-    else:
-        a, b = so3.rodrigues(square)
-    for i in range(3):
-        side = cross(rotation[i], phi)
-        back = cross(side, phi)
-        for j in range(3):
-            out[i, j] = rotation[i, j] + a * side[j] + b * back[j]
-
-
-@inlined_kernel
-def _rotation_at(path: GyroPath, time: float, k: int, rotation: Array, rate: Array) -> None:
-    """Fill the rotation (3, 3) and the rate (3,) at a time from knot `k` on."""
-    dt = time - path.times[k]
-    share = dt / (path.times[k + 1] - path.times[k])
-    for i in range(3):
-        rate[i] = path.rates[k, i] + share * (path.rates[k + 1, i] - path.rates[k, i])
-    _path_rotation(path.rotations[k], path.rates[k], rate, dt, rotation)
-
-
-@kernel
-def _knot_before(times: Array, time: float, near: int) -> int:
-    """Index of the last knot not after `time`, within [0, K - 2], searched from `near` on."""
-    k = min(max(near, 0), len(times) - 2)
-    while k > 0 and times[k] > time:
-        k -= 1
-    while k < len(times) - 2 and times[k + 1] <= time:
-        k += 1
-    return k
-
-
-@kernel
-def _evaluated(path: GyroPath, at: Array) -> Array:
-    out, rate = np.empty((len(at), 3, 3)), np.empty(3)
-    k = 0
-    for n in range(len(at)):
-        k = _knot_before(path.times, at[n], k)
-        _rotation_at(path, at[n], k, out[n], rate)
-    return out
-
 
 # -- Data and unknowns ----------------------------------------------------------------------------
 
@@ -268,8 +177,8 @@ def _look(
     sight: _Sight,
 ) -> tuple[int, Vector]:
     """Fill Q, M and rate of `sight` at a time; the knot before it, and the ray of a point."""
-    k = _knot_before(path.times, time, near)
-    _rotation_at(path, time, k, sight.M, sight.rate)
+    k = knot_before(path.times, time, near)
+    write_state(path, time, k, sight.M, sight.rate)
     multiply(correction, sight.M, sight.Q)
     multiply(sight.Q, R_imu_cam, sight.M)
     return k, rotated(sight.M, (point[0], point[1], 1.0))
@@ -381,7 +290,13 @@ def _add_lens(
 
 @inlined_kernel
 def _integrate(
-    problem: Problem, path: GyroPath, middle: int, k: int, time: float, sight: _Sight
+    problem: Problem,
+    path: GyroPath,
+    turned: Array,
+    middle: int,
+    k: int,
+    time: float,
+    sight: _Sight,
 ) -> None:
     """Fill blur and by_bias of `sight` at a time after knot `k`."""
     dt = time - path.times[k]
@@ -393,7 +308,7 @@ def _integrate(
         )
         for j in range(3):
             sight.by_bias[i, j] = (
-                path.turned[k, i, j] - path.turned[middle, i, j] + dt * path.rotations[k, i, j]
+                turned[k, i, j] - turned[middle, i, j] + dt * path.rotations[k, i, j]
             )
 
 
@@ -410,6 +325,7 @@ def _add_match(J: Array, r: float, weight: float, gradient: Array, hessian: Arra
 def accumulate(
     problem: Problem,
     path: GyroPath,
+    turned: Array,
     unknowns: Unknowns,
     tangent: Array,
     derivatives: bool,
@@ -417,7 +333,9 @@ def accumulate(
 ) -> None:
     """Sum robust losses, gradients and Hessians over the matches of each pair, without priors.
 
-    `tangent` (P, 2, 3) spans the steps of each direction. With ``d = r / noise`` and
+    `turned` (K, 3, 3) is the integral of the rotations over time at the knots [s]: a rate error db
+    turns the rotation at knot k by ``turned_k db``, in the frame of the start. `tangent` (P, 2, 3)
+    spans the steps of each direction. With ``d = r / noise`` and
     ``l = 1 / (1 + d^2 / ROBUST^2)`` the loss of a match is ``d^2 l / 2`` (Geman-McClure).
     """
     parameters = unknowns.parameters
@@ -458,8 +376,8 @@ def accumulate(
                 r, s, m1, m2, b, c1, c2, by_pixels1, by_pixels2
             )
             J[:] = 0.0
-            _integrate(problem, path, middle, k1, t1, sight1)
-            _integrate(problem, path, middle, k2, t2, sight2)
+            _integrate(problem, path, turned, middle, k1, t1, sight1)
+            _integrate(problem, path, turned, middle, k2, t2, sight2)
             _add_view(J, by_1, sight1, row1, covariates[0], -0.5, Q_middle)
             _add_view(J, by_2, sight2, row2, covariates[1], 0.5, Q_middle)
             _add_lens(J, problem, 0, n, by_m1, c1, sight1.M, r / s**2)

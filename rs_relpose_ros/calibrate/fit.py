@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes seconds to import, at the start of a node
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate import coplanarity as model
@@ -28,6 +29,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
 )
 from rs_relpose_ros.core.losses import geman_mcclure_weight, robust_scale
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.so3 import log_so3
 
 # Stretches of a second, within which errors may be correlated, and limits of their number.
@@ -195,9 +197,12 @@ def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums
         np.zeros((size, model.ALL)),
         np.zeros((size, model.ALL, model.ALL)),
     )
+    path = _path(problem, unknowns)
+    turned = cumulative_trapezoid(path.rotations, path.times, axis=0, initial=0.0)
     model.accumulate(
         _through_lens(problem, unknowns),
-        _path(problem, unknowns),
+        path,
+        turned,
         unknowns,
         _tangents(unknowns),
         derivatives,
@@ -281,10 +286,10 @@ def _medians(problem: Problem, values: Array) -> Array:
     )
 
 
-def _path(problem: Problem, unknowns: Unknowns) -> model.GyroPath:
+def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
     parameters = unknowns.parameters
     estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
-    return model.GyroPath.integrated(problem.gyro_times, estimated, parameters[model.BIAS])
+    return GyroPath.integrated(problem.gyro_times, estimated - parameters[model.BIAS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

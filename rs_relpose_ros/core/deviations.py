@@ -66,11 +66,12 @@ def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
     return {name: slice(first[name], first[name] + size) for name, size in sizes.items()}
 
 
-_PARTS = slices({entry.name: entry.size for entry in ENTRIES})
+# Places of the entries in the whole vector.
+PARTS = slices({entry.name: entry.size for entry in ENTRIES})
 # Number of values of the whole vector.
 N_DEVIATIONS = sum(entry.size for entry in ENTRIES)
 # Places of the entries of `geometry.lens` in the whole vector.
-LENS = slice(_PARTS['focal_log'].start, _PARTS['principal_point'].stop)
+LENS = slice(PARTS['focal_log'].start, PARTS['principal_point'].stop)
 
 # Basis (3, 1) of one value that is common to the three components of an entry.
 COMMON = np.ones((3, 1))
@@ -93,7 +94,7 @@ class Selection:
 
         The order is the order of `ENTRIES`.
         """
-        unknown = {*names, *bases} - _PARTS.keys()
+        unknown = {*names, *bases} - PARTS.keys()
         if unknown:
             raise ValueError(f'not the names of deviations: {sorted(unknown)}')
         chosen = [entry for entry in ENTRIES if entry.name in {*names, *bases}]
@@ -102,7 +103,7 @@ class Selection:
         parts = slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
         whole = np.zeros((N_DEVIATIONS, sum(sizes)))
         for (name, part), basis in zip(parts.items(), own, strict=True):
-            whole[_PARTS[name], part] = basis
+            whole[PARTS[name], part] = basis
         return cls(
             whole,
             parts,
@@ -165,5 +166,5 @@ def by_stamped_row(selection: Selection, share: float) -> Array:
     The middle row is read `share` of the readout after the stamped row, and so are its deviations.
     """
     basis = selection.basis.copy()
-    basis[_PARTS['time_offset'], selection.part('readout_time')] = share
+    basis[PARTS['time_offset'], selection.part('readout_time')] = share
     return basis

@@ -5,18 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
-from rs_relpose_ros.geometry.so3 import (
-    copy_matrix,
-    copy_vector,
-    exp_so3,
-    integrated_rotations,
-    log_so3,
-    multiply,
-)
+from rs_relpose_ros.geometry.gyro import GyroPath
+from rs_relpose_ros.geometry.so3 import copy_matrix, exp_so3
 from rs_relpose_ros.jit import kernel
 
 # Largest rate of an argument [rad/s]: products of larger numbers may overflow.
@@ -46,21 +40,16 @@ class FrameMotion:
         Rate [rad/s] in the camera's own frame.
     gravity : (3,) array_like, optional
         Direction of free fall (**down**), any length, in the camera frame at the reference row.
-    knot_times : (K,) array_like
-        Row times [s] of the integrated gyro, increasing; empty for a constant rate.
-    knot_rotations : (K, 3, 3) array_like
-        Orientation at each knot, in the camera frame of the reference row.
+    path : GyroPath, optional
+        The integrated gyro over the row times, relative to the reference row; None for a constant
+        rate.
     """
 
     angular_velocity: Array
     gravity: Array | None = None
-    knot_times: Array | None = None
-    knot_rotations: Array | None = None
+    path: GyroPath | None = None
 
     def __post_init__(self) -> None:
-        for name in ('knot_times', 'knot_rotations'):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
         object.__setattr__(
             self,
             'angular_velocity',
@@ -117,20 +106,12 @@ class FrameMotion:
                 'times must enclose 0, the time of the reference row, '
                 f'got [{times[0]:.6f}, {times[-1]:.6f}] s'
             )
-        rotations = integrated_rotations(times, rates)
         # The mean over the rows: one sample has several times its noise.
         mean_rate = (
             0.5 * (times[1:] - times[:-1]) @ (rates[1:] + rates[:-1]) / (times[-1] - times[0])
         )
-        at_reference, _ = rotations_between(
-            times, rotations, np.zeros(1), times.searchsorted(np.zeros(1), side='right')
-        )
-        return cls(
-            mean_rate,
-            None if gravity is None else np.asarray(gravity),
-            times,
-            at_reference[0].T @ rotations,
-        )
+        path = GyroPath.integrated(times, rates).about(0.0)
+        return cls(mean_rate, None if gravity is None else np.asarray(gravity), path)
 
     def rotations(self, row_times: ArrayLike) -> Array:
         """Orientation (N, 3, 3) at row times (N,) [s], in the frame of the reference row.
@@ -141,18 +122,16 @@ class FrameMotion:
             A row time lies outside of the gyro samples: there is no extrapolation.
         """
         tau = np.ascontiguousarray(row_times, dtype=np.float64)
-        if self.knot_times is None or self.knot_rotations is None:
+        if self.path is None:
             return rotations_at_rate(self.angular_velocity, tau)
-        times = self.knot_times
-        rotations, covered = rotations_between(
-            times, self.knot_rotations, tau, np.searchsorted(times, tau, side='right')
-        )
-        if not covered:
+        first, last = self.path.times[[0, -1]]
+        # Written so that NaN is not covered.
+        if not np.all((tau >= first - _TOLERANCE) & (tau <= last + _TOLERANCE)):
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
-                f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s'
+                f'samples, [{first:.6f}, {last:.6f}] s'
             )
-        return rotations
+        return self.path.at(tau)
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
         """Rays (N, 3) of row times (N,) [s], rotated into the frame of the reference row."""
@@ -163,14 +142,8 @@ class FrameMotion:
         """The same motion with the reference row `delay` seconds later."""
         rotation = self.rotations([delay])[0]
         moved = self.gravity if self.gravity is None else rotation.T @ self.gravity
-        if self.knot_times is None or self.knot_rotations is None:
-            return validate.replaced(self, gravity=moved)
-        return validate.replaced(
-            self,
-            gravity=moved,
-            knot_times=self.knot_times - delay,
-            knot_rotations=rotation.T @ self.knot_rotations,
-        )
+        path = self.path if self.path is None else self.path.about(delay)
+        return validate.replaced(self, gravity=moved, path=path)
 
 
 @kernel
@@ -180,32 +153,6 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
     for i in range(len(times)):
         copy_matrix(exp_so3(times[i] * rate), out[i])
     return out
-
-
-@kernel
-def rotations_between(
-    knot_times: Array, knot_rotations: Array, times: Array, after: NDArray[np.int64]
-) -> tuple[Array, bool]:
-    """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
-
-    `after` (N,): index of the first knot after each time. Also whether the knots enclose all
-    times; the orientation beyond them is that of the last knot.
-    """
-    out = np.empty((len(times), 3, 3))
-    steps = np.empty((len(knot_times) - 1, 3))
-    for k in range(len(steps)):
-        copy_vector(log_so3(knot_rotations[k].T @ knot_rotations[k + 1]), steps[k])
-    covered = True
-    for i in range(len(times)):
-        # Written so that NaN is not covered.
-        covered &= (
-            times[i] >= knot_times[0] - _TOLERANCE and times[i] <= knot_times[-1] + _TOLERANCE
-        )
-        time = min(max(times[i], knot_times[0]), knot_times[-1])
-        k = min(max(after[i] - 1, 0), len(steps) - 1)
-        fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
-        multiply(knot_rotations[k], exp_so3(fraction * steps[k]), out[i])
-    return out, covered
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -280,34 +280,11 @@ def median(values: Array) -> float:
     return upper if n % 2 == 1 else 0.5 * (smallest(values, n // 2 - 1) + upper)
 
 
-# Integration of a gyro on SO(3) with a rate that is linear between samples:
-#
-#     R_0 = I        R_{k+1} = R_k Exp(phi_k)
-#     phi_k = (w_k + w_{k+1}) dt / 2 + (w_k x w_{k+1}) dt^2 / 12
-#
-# by the Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
-
-
 @small_kernel
 def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:
-    """Rotation vector ``phi`` (3,) of a step of `dt` [s] between two rates (3,) [rad/s]."""
+    """Rotation vector (3,) of a step of `dt` [s] between two rates (3,) [rad/s]: see `gyro`."""
     phi = np.empty(3)
     commutator = cross(rate1, rate2)
     for i in range(3):
         phi[i] = 0.5 * (rate1[i] + rate2[i]) * dt + commutator[i] * dt * dt / 12.0
     return phi
-
-
-@kernel
-def integrated_rotations(seconds: Array, rates: Array) -> Array:
-    """``R_k`` (K, 3, 3) from sample k to the first one.
-
-    `seconds` (K,) are increasing times, `rates` (K, 3) the rates at these times [rad/s].
-    """
-    rotations = np.empty((len(seconds), 3, 3))
-    rotations[0] = 0.0
-    rotations[0, 0, 0] = rotations[0, 1, 1] = rotations[0, 2, 2] = 1.0
-    for k in range(len(seconds) - 1):
-        phi = step_rotation(rates[k], rates[k + 1], seconds[k + 1] - seconds[k])
-        multiply(rotations[k], exp_so3(phi), rotations[k + 1])
-    return rotations

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
+from rs_relpose_ros.geometry.gyro import integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import integrated_rotations, STANDARD_GRAVITY
+from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias

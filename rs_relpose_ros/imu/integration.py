@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array, so3, validate
+from rs_relpose_ros.geometry.gyro import integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
-from rs_relpose_ros.geometry.so3 import integrated_rotations, skew
+from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.jit import kernel
 
@@ -51,6 +52,13 @@ class ImuSlice:
     def covariance(self) -> Array:
         """Covariance (3, 3) [rad^2] of the error of `rotation`; see `integrate_rotation`."""
         return self._integrated[1]
+
+    @property
+    def noise_covariance(self) -> Array:
+        """Covariance (3, 3) [rad^2] of the error of `rotation` by the gyro's white noise alone."""
+        rates = np.ascontiguousarray(self.angular_velocities)
+        _, _, noise = _integrate((self.stamps_ns - self.stamps_ns[0]) * 1e-9, rates)
+        return self.noise_density**2 * noise
 
     @cached_property
     def _integrated(self) -> tuple[Array, Array]:
@@ -169,32 +177,6 @@ def integrate_rotation(
     rotation, derivative, noise = _integrate(seconds, np.ascontiguousarray(rates))
     covariance = noise_density**2 * noise + bias_sigma**2 * derivative @ derivative.T
     return rotation, covariance
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RotationSensitivity:
-    """Effects on a rotation integrated from the gyro, as rotations on its left."""
-
-    noise: Array  # (3, 3) covariance of its white noise alone [rad^2]
-    by_rate: Array  # (3, 3) derivative by a constant error of the rates [s]
-    by_scale: Array  # (3,) derivative by a relative change of all rates [rad]
-
-
-def rotation_sensitivity(
-    stamps_ns: Stamps, rates: Array, noise_density: float
-) -> RotationSensitivity:
-    """Sensitivity of ``R_start^T R_end``; arguments as in `integrate_rotation`."""
-    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
-    rotation, by_rate, noise = _integrate(seconds, np.ascontiguousarray(rates))
-    scaled, _, _ = _integrate(seconds, (1.0 + _SCALE_STEP) * rates)
-    by_scale = so3.log_so3(scaled @ rotation.T) / _SCALE_STEP
-    return RotationSensitivity(noise_density**2 * noise, by_rate, by_scale)
-
-
-# Relative change of the rates by which their scale is differentiated. The rotation is smooth in
-# it: the error of the derivative is this share of it, and rounding adds 1e-12 of a rotation.
-# [chosen: any value in 1e-6..1e-3 would do]
-_SCALE_STEP = 1e-4
 
 
 # -- Preintegrated acceleration of the IMU, with its covariance -----------------------------------

@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
-from rs_relpose_ros.geometry.so3 import integrated_rotations, log_so3, STANDARD_GRAVITY
+from rs_relpose_ros.geometry.gyro import integrated_rotations
+from rs_relpose_ros.geometry.so3 import log_so3, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuInterval, ImuSamples
 from rs_relpose_ros.imu.integration import force_integrals

@@ -22,7 +22,7 @@ from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
-from rs_relpose_ros.imu.integration import FrameImu, ImuSlice, rotation_sensitivity
+from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import findings, pair
 from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
@@ -396,9 +396,6 @@ def _measurement(
     problem: PairProblem, fitted: RelativePose, since: ImuSlice, parameters: Parameters
 ) -> PairData:
     """A pair as the consistency monitor gets it."""
-    sensitivity = rotation_sensitivity(
-        since.stamps_ns, since.angular_velocities, since.noise_density
-    )
     return PairData(
         problem.matches.points1,
         problem.matches.points2,
@@ -408,9 +405,6 @@ def _measurement(
         float(problem.seconds[-1]),
         fitted.R,
         fitted.t,
-        since.rotation,
-        since.covariance,
-        sensitivity,
         since,
         parameters.sensor.R_cam_imu,
         parameters.estimator.gyro_sigma,

@@ -13,25 +13,36 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.core.deviations import LENS, LIVE
+from rs_relpose_ros.core.deviations import (
+    by_stamped_row,
+    COMMON,
+    FIRST,
+    LENS,
+    LIVE,
+    N_DEVIATIONS,
+    Selection,
+)
+from rs_relpose_ros.core.epipolar import derivatives
 from rs_relpose_ros.core.least_squares import inverse
 from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
+from rs_relpose_ros.core.rows import row_states, RowStates
 from rs_relpose_ros.estimator import priors
 from rs_relpose_ros.estimator.covariance import image_regions, IMAGES, POSE, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import PARAMETERS, TANGENT, THETA, TwoViewState
-from rs_relpose_ros.estimator.problem import build_problem, derotate, TwoViewProblem
+from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.estimator.sampling import translation_direction
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.gyro import GyroPath
+from rs_relpose_ros.geometry.lens import N_LENS
+from rs_relpose_ros.geometry.motion import FrameMotion, rotations_at_rate
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
-from rs_relpose_ros.imu.integration import ImuSlice, RotationSensitivity
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.imu.integration import ImuSlice
 
 # Sigma of the velocities about the mean one [baselines per second].
 _VELOCITY_SIGMA = 1.0
@@ -42,16 +53,16 @@ _LEAST_SIGMA = 0.05
 _LEAST_ROTATION_SIGMA = 1e-5
 # Largest number of matches, evenly over those of the pair: more add cost and little information.
 _MOST_MATCHES = 120
-# Step of numerical derivatives: far below the noise of a residual, far above rounding.
-_STEP = 1e-5
 # Gyro beyond the rows [s].
 _LEAST_SPAN = 1e-4
 # Steps of a new fit of a pair.
 _NEW_STEPS = 3
 # Places of single deviations in the vector c.
+# Deviations of which the pose has a doubt: the principal point is not estimated, since axes of the
+# IMU have nearly the same effect.
+_DOUBTED = Selection.of(*LIVE.parts, 'principal_point', gyro_scale=COMMON, distortion=FIRST)
 _OFFSET = LIVE.index('time_offset')
 _READOUT = LIVE.index('readout_time')
-_SCALE = LIVE.index('gyro_scale')
 _DISTORTION = LIVE.index('distortion')
 # Number of deviations before those of the lens, which come last.
 _LENS = LIVE.index('focal_log')
@@ -71,10 +82,7 @@ class PairData:
     interval: float  # [s]
     R: Array  # (3, 3) as estimated, between the stamped rows
     t: Array  # (3,) NaN where there is none
-    gyro_rotation: Array  # (3, 3) between the stamped rows
-    gyro_covariance: Array  # (3, 3) of that, as in the estimate
-    gyro_sensitivity: RotationSensitivity  # of that
-    segment: ImuSlice  # of that
+    segment: ImuSlice  # between the stamped rows
     R_cam_imu: Array
     gyro_sigma: float  # [rad/s] of the rate within a frame
 
@@ -95,147 +103,276 @@ class PairInformation:
     images_by_deviation: Array
 
 
+class _Linearised(NamedTuple):
+    """A pair at its fitted state: residuals, and derivatives by the state and C deviations.
+
+    The matches depend on both. The rotation by the gyro is a prior of the state, and the gyro
+    depends on the deviations: ``theta = Log(R R_gyro^T)`` becomes smaller by ``gyro dc``.
+    """
+
+    state: TwoViewState
+    observations: Array  # (N, 20) rows of `sampson`
+    residuals: Array  # (N,) [px]
+    by_state: Array  # (N, 17)
+    by_deviation: Array  # (N, C)
+    prior: priors.Priors  # of the state
+    theta: Array  # (3,)
+    gyro: Array  # (3, C) rotation of R_gyro, on its left
+
+
+class _Normal(NamedTuple):
+    """Normal equations of a pair: H of the state, C of the state by the deviations."""
+
+    H: Array  # (17, 17)
+    gradient: Array  # (17,)
+    mixed: Array  # (17, C)
+    own: Array  # (C, C)
+    own_gradient: Array  # (C,)
+
+
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
     """Information of a pair, linearised about the deviations `about` (K,).
 
     Those applied already are `active` (K,): about others the pair is fitted again. None if there
     are too few matches, or if a fit far from the gyro's rotation diverges.
     """
-    at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
+    at = about - active
+    step = math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
     pair = replace(
         pair,
         camera=_lens(pair.camera, *at[_LENS:]),
         points1=pair.points1[::step],
         points2=pair.points2[::step],
     )
-    noise = pair.gyro_sensitivity.noise + _LEAST_ROTATION_SIGMA**2 * np.eye(3)
-    problem = build_problem(
+    problem = problem_of(pair)
+    information = problem.rotation_information
+    if np.count_nonzero(problem.valid) < PARAMETERS or information is None:
+        return None
+    linear = _linearised(pair, problem, at)
+    sigma = robust_scale(linear.residuals, _LEAST_SIGMA, 0.0)
+    weights = cauchy_weight((linear.residuals / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
+    normal = _normal_equations(linear, weights, information)
+    solved = inverse(normal.H) @ np.column_stack([normal.mixed, normal.gradient])
+    if not np.isfinite(solved).all():
+        return None
+    estimated = slice(0, LIVE.size)
+    S = (normal.own - normal.mixed.T @ solved[:, :-1])[estimated, estimated]
+    S = 0.5 * (S + S.T)
+    b = (normal.mixed.T @ solved[:, -1] - normal.own_gradient)[estimated]
+    ratio, if_distorted = _common_noise(
+        FitMatches(linear.observations, weights, 1.0),
+        (linear.by_deviation - linear.by_state @ solved[:, :-1])[:, estimated],
+        linear.residuals - linear.by_state @ solved[:, -1],
+        S,
+    )
+    S, b = S / ratio, b / ratio
+    by_deviation, whitened = _shifts(pair, problem, linear, normal)
+    return PairInformation(
+        S,
+        b + S @ about,
+        ratio / if_distorted,
+        by_deviation[:, estimated],
+        by_deviation[:, LIVE.size :],
+        whitened[:, estimated],
+        _images_against_gyro(linear, normal, information),
+        _images_by_deviation(linear, normal, information, bool(np.isfinite(pair.t).all())),
+    )
+
+
+def problem_of(pair: PairData) -> TwoViewProblem:
+    """The pair at its middle rows, its rotation known by the gyro up to its noise."""
+    return build_problem(
         pair.points1,
         pair.points2,
         pair.camera,
         pair.motion1,
         pair.motion2,
-        pair.gyro_rotation,
-        noise,
+        pair.segment.rotation,
+        pair.segment.noise_covariance + _LEAST_ROTATION_SIGMA**2 * np.eye(3),
     )
-    keep = problem.valid
-    rotation, information = problem.rotation, problem.rotation_information
-    if np.count_nonzero(keep) < PARAMETERS or rotation is None or information is None:
-        return None
-    D, turns, shares = _gyro(pair), *_by_rows(pair, problem, keep)
-    moved = (turns @ at[:_LENS])[None], (shares * at[_READOUT])[None]
-    rotation = so3.exp_so3(D[:, : LIVE.size] @ at) @ rotation
-    observations = _displaced(problem.observations[None, keep], *moved)[0]
+
+
+class FrameRows(NamedTuple):
+    """Matches of one frame at the deviations about which a pair is linearised."""
+
+    views: Array  # (N, 3, 3) ray and its derivatives by u and v, in axes of the middle row
+    times: Array  # (N,) of the rows after the middle row [s]
+    states: RowStates  # rotation of the views on the left, and delay of the times
+    views_by_lens: Array  # (N, 3, 3, 7)
+
+
+def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -> FrameRows:
+    """The matches of an image with deviations `at` (D,) other than those of the lens."""
+    camera = pair.camera
+    points = (pair.points1, pair.points2)[image][problem.valid]
+    motion = (problem.motion1, problem.motion2)[image]
+    rate = motion.angular_velocity
+    of_image = problem.observations[problem.valid]
+    times = of_image[:, 18 + image]
+    shares = (points[:, 1] - 0.5 * (camera.height - 1)) / camera.height
+    path = GyroPath.constant(rate, -1.0, 1.0) if motion.path is None else motion.path
+    states = row_states(path, pair.R_cam_imu, times, shares)
+    views = of_image[:, 9 * image : 9 * image + 9].reshape(-1, 3, 3)
+    by_lens = camera.rays_by_lens(points)
+    rays_by_lens = by_lens.by_lens[:, None], by_lens.by_pixel_by_lens.swapaxes(1, 2)
+    moved = states.rotation[:, None] @ np.concatenate(rays_by_lens, axis=1)
+    # One row further down, the camera has rotated for one more line delay.
+    moved[:, 2] += camera.line_delay * (so3.skew(rate) @ moved[:, 0])
+    if at.any():
+        turned = Rotation.from_rotvec(states.by_deviation @ at).as_matrix()
+        views = views @ turned.swapaxes(1, 2)
+        moved = turned[:, None] @ moved
+        times = times + states.time_by_deviation @ at
+    return FrameRows(views, times, states, moved)
+
+
+def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearised:
+    """The pair fitted at deviations `at` (K,) from the active ones, and linearised there."""
+    basis = by_stamped_row(_DOUBTED, middle_share(pair.camera))
+    turning = basis[:, :_LENS] @ at[:_LENS]  # the lens is in the camera already
+    frames = [frame_rows(pair, problem, image, turning) for image in (0, 1)]
+    observations = np.column_stack(
+        [*(rows.views.reshape(-1, 9) for rows in frames), *(rows.times for rows in frames)]
+    )
+    gyro = _gyro(pair)
+    rotation = np.ascontiguousarray(so3.exp_so3(gyro @ turning) @ problem.rotation)
+    assert problem.rotation_information is not None
     prior = priors.Priors(
         np.zeros(3),
         np.zeros(3),
         0.0,
         0.0,
         pair.gyro_sigma**-2,
-        np.ascontiguousarray(rotation),
-        information,
+        rotation,
+        problem.rotation_information,
         priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval),
     )
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
-    r = residuals(observations, state)
-    sigma = robust_scale(r, _LEAST_SIGMA, 0.0)
-    weights = cauchy_weight((r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
-    J_x = jacobian(observations, state)
-    delays = np.zeros((_LENS, *shares.shape))
-    delays[_READOUT] = _STEP * shares
-    stepped = (
-        _displaced(observations[None], _STEP * np.moveaxis(turns, -1, 0), delays),
-        _displaced(_by_lens(pair, problem, keep), *moved),
+    residuals, by_deviation = residuals_by_deviation(state, frames)
+    return _Linearised(
+        state,
+        observations,
+        residuals,
+        jacobian(observations, state),
+        by_deviation @ basis,
+        prior,
+        so3.log_so3(np.ascontiguousarray(state.R @ rotation.T)),
+        gyro @ basis,
     )
-    J_c = (residuals(np.vstack(stepped).reshape(-1, 20), state).reshape(-1, len(r)) - r).T / _STEP
-    # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro rotated by D c makes smaller.
-    theta = so3.log_so3(np.ascontiguousarray(state.R @ rotation.T))
+
+
+def residuals_by_deviation(state: TwoViewState, frames: list[FrameRows]) -> tuple[Array, Array]:
+    """Residuals (N,) [px] and their derivatives (N, D) by all deviations."""
+    first, second = frames
+    baselines = state.t - np.outer(first.times, state.d1) + np.outer(second.times, state.d2)
+    # Rotations of the views of each image into the axes of image 1.
+    rotations = (
+        rotations_at_rate(state.dw1, first.times),
+        rotations_at_rate(state.dw2, second.times) @ state.R,
+    )
+    views = [
+        rows.views @ to_first.swapaxes(1, 2)
+        for to_first, rows in zip(rotations, frames, strict=True)
+    ]
+    by = derivatives(np.stack(views, axis=1), baselines)
+    total = np.zeros((len(baselines), N_DEVIATIONS))
+    rates = ((-state.d1, state.dw1), (state.d2, state.dw2))
+    for k, (velocity, rate) in enumerate(rates):
+        rows, to_first = frames[k], rotations[k]
+        by_turn = by.by_rotation[:, k, None] @ to_first
+        by_view = (by.by_rays[:, k] @ to_first).reshape(-1, 1, 9)
+        by_time = by.by_baseline @ velocity + by.by_rotation[:, k] @ rate
+        total += (by_turn @ rows.states.by_deviation)[:, 0]
+        total += by_time[:, None] * rows.states.time_by_deviation
+        total[:, LENS] += (by_view @ rows.views_by_lens.reshape(-1, 9, N_LENS))[:, 0]
+    return by.residuals, total
+
+
+def _gyro(pair: PairData) -> Array:
+    """Rotation (3, D) of the gyro's rotation between the middle rows by all deviations."""
+    segment = pair.segment
+    times = (segment.stamps_ns - segment.stamps_ns[0]) * 1e-9
+    path = GyroPath.integrated(times, np.ascontiguousarray(segment.angular_velocities))
+    return row_states(path, pair.R_cam_imu, times[-1:], np.zeros(1)).by_deviation[0]
+
+
+def _normal_equations(linear: _Linearised, weights: Array, information: Array) -> _Normal:
+    """Normal equations with the priors of the state, of which `information` (3, 3) is the gyro."""
     H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    priors.add_priors(state, prior, H, gradient)
-    weighted = J_x.T * weights
-    H, gradient, C = H + weighted @ J_x, gradient + weighted @ r, weighted @ J_c
-    images_by_deviation = _images_by_deviation(H, C, information, bool(np.isfinite(pair.t).all()))
-    C[THETA : THETA + 3] -= information @ D
-    solved = inverse(H) @ np.column_stack([C, gradient])
-    if not np.isfinite(solved).all():
-        return None
-    S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
-    b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
-    # The principal point is not estimated: axes of the IMU have nearly the same effect.
-    S, b = 0.5 * (S + S.T)[: LIVE.size, : LIVE.size], b[: LIVE.size]
-    ratio, if_distorted = _common_noise(
-        FitMatches(observations, weights, 1.0),
-        (J_c - J_x @ solved[:, :-1])[:, : LIVE.size],
-        r - J_x @ solved[:, -1],
-        S,
-    )
-    S, b = S / ratio, b / ratio
-    by_deviation, whitened = _shifts(pair, problem, state, H.copy(), C, D)
-    # The rotation by the images: the step without the gyro's prior.
-    H[THETA : THETA + 3, THETA : THETA + 3] -= information
-    gradient[THETA : THETA + 3] -= information @ theta
-    return PairInformation(
-        S,
-        b + S @ about,
-        ratio / if_distorted,
-        by_deviation[:, : LIVE.size],
-        by_deviation[:, LIVE.size :],
-        whitened[:, : LIVE.size],
-        np.asarray(theta - (inverse(H) @ gradient)[THETA : THETA + 3]),
-        images_by_deviation,
+    priors.add_priors(linear.state, linear.prior, H, gradient)
+    weighted = linear.by_state.T * weights
+    mixed = weighted @ linear.by_deviation
+    mixed[THETA : THETA + 3] -= information @ linear.gyro
+    weighted_deviations = linear.by_deviation.T * weights
+    of_gyro = linear.gyro.T @ information
+    return _Normal(
+        H + weighted @ linear.by_state,
+        gradient + weighted @ linear.residuals,
+        mixed,
+        weighted_deviations @ linear.by_deviation + of_gyro @ linear.gyro,
+        weighted_deviations @ linear.residuals - of_gyro @ linear.theta,
     )
 
 
-def _images_by_deviation(H: Array, C: Array, of_gyro: Array, has_direction: bool) -> Array:
+def _images_against_gyro(linear: _Linearised, normal: _Normal, information: Array) -> Array:
+    """Log (3,) [rad] of the rotation by images alone and R_gyro^T: a step without that prior."""
+    part = slice(THETA, THETA + 3)
+    H, gradient = normal.H.copy(), normal.gradient.copy()
+    H[part, part] -= information
+    gradient[part] -= information @ linear.theta
+    return np.asarray(linear.theta - (inverse(H) @ gradient)[part])
+
+
+def _images_by_deviation(
+    linear: _Linearised, normal: _Normal, information: Array, has_direction: bool
+) -> Array:
     """Change of pose and velocities by the images alone (11, 9) with the deviations of IMAGES.
 
-    H (17, 17), C (17, 13): information of the unknowns, and with the deviations, of the matches.
-    The prior of the velocities stays in H: where the images do not observe them, their change
-    would be unbounded. Without a direction only the rotation changes.
+    The prior of the velocities stays: where the images do not observe them, their change would be
+    unbounded. Without a direction only the rotation changes.
     """
-    H = H.copy()
-    H[THETA : THETA + 3, THETA : THETA + 3] -= of_gyro
-    moved = np.zeros((POSE, C.shape[1]))
+    of_theta = slice(THETA, THETA + 3)
+    H, mixed = normal.H.copy(), normal.mixed.copy()
+    H[of_theta, of_theta] -= information
+    mixed[of_theta] += information @ linear.gyro
+    moved = np.zeros((POSE, mixed.shape[1]))
     if has_direction:
-        moved[:] = -(inverse(H) @ C)[:POSE]
+        moved[:] = -(inverse(H) @ mixed)[:POSE]
     else:
-        of_theta = slice(THETA, THETA + 3)
-        moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], C[of_theta])
+        moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], mixed[of_theta])
     by_deviation = np.empty((POSE, IMAGES.size))
     for name, columns in IMAGES.parts.items():
-        own = slice(LIVE.size, None) if name == 'principal_point' else LIVE.part(name)
-        by_deviation[:, columns] = moved[:, own]
+        by_deviation[:, columns] = moved[:, _DOUBTED.part(name)]
     return by_deviation
 
 
 def _shifts(
-    pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array, D: Array
+    pair: PairData, problem: TwoViewProblem, linear: _Linearised, normal: _Normal
 ) -> tuple[Array, Array]:
-    """Shift of the estimated pose by deviations and center, (6, 13), and whitened, (5, 13).
+    """Shift of the estimated pose by C deviations, (6, C), and whitened, (5, C).
 
-    With the prior of the estimate for the gyro's rotation; H and C are changed. The state is that
-    at the middle row, which a longer readout time delays, by D = share c, but not the stamped one:
+    With the prior of the estimate for the gyro's rotation. The state is that at the middle row,
+    which a longer readout time delays by D = share c against the stamped row:
     ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
     """
     assert problem.rotation_information is not None
-    prior_information = np.linalg.inv(pair.gyro_covariance)
-    H[THETA : THETA + 3, THETA : THETA + 3] += prior_information - problem.rotation_information
-    C[THETA : THETA + 3] += (problem.rotation_information - prior_information) @ D
-    covariance, tangent = inverse(H), so3.tangent_basis(state.t)
-    moved = -covariance @ C
+    part, direction = slice(THETA, THETA + 3), slice(TANGENT, TANGENT + 2)
+    more = np.linalg.inv(pair.segment.covariance) - problem.rotation_information
+    H, mixed = normal.H.copy(), normal.mixed.copy()
+    H[part, part] += more
+    mixed[part] -= more @ linear.gyro
+    covariance, tangent = inverse(H), so3.tangent_basis(linear.state.t)
+    moved = -covariance @ mixed
     to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
     share, rates = middle_share(pair.camera), pair.segment.angular_velocities
-    rate1, rate2 = to_middle @ rates[0], to_middle @ (pair.gyro_rotation @ rates[-1])
-    moved[TANGENT : TANGENT + 2, _READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
-    moved[THETA : THETA + 3, _READOUT] += share * (rate1 - rate2)
+    rate1 = to_middle @ rates[0]
+    rate2 = to_middle @ (pair.segment.rotation @ rates[-1])
+    moved[direction, _READOUT] += share * (tangent.T @ so3.skew(rate1) @ linear.state.t)
+    moved[part, _READOUT] += share * (rate1 - rate2)
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     # In the axes of the stamped row.
-    by_deviation = np.vstack(
-        [
-            to_middle.T @ tangent @ moved[TANGENT : TANGENT + 2],
-            to_middle.T @ moved[THETA : THETA + 3],
-        ]
-    )
+    to_stamped = to_middle.T
+    by_deviation = np.vstack([to_stamped @ tangent @ moved[direction], to_stamped @ moved[part]])
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
@@ -295,110 +432,6 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
     return camera.moved_lens(LIVE.basis[LENS, _LENS:] @ (focal, distortion))
 
 
-def _gyro(pair: PairData) -> Array:
-    """Left derivative (3, 13) of the gyro's rotation between the middle rows, as of the rays."""
-    D, rates = np.zeros((3, LIVE.size + 2)), pair.segment.angular_velocities
-    D[:, LIVE.part('axes')] = np.eye(3) - pair.gyro_rotation
-    D[:, _OFFSET] = pair.gyro_rotation @ rates[-1] - rates[0]
-    D[:, _READOUT] = middle_share(pair.camera) * D[:, _OFFSET]
-    D[:, LIVE.part('gyro_bias')] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
-    D[:, _SCALE] = pair.gyro_sensitivity.by_scale
-    return D
-
-
-def _by_lens(pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> Array:
-    """Observations (4, N, 20) with steps of focal length, distortion and the principal point [px].
-
-    Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
-    pixels would shrink with a longer focal length.
-    """
-    camera, n = pair.camera, int(np.count_nonzero(keep))
-    centre, out = np.array([camera.cx, camera.cy]), np.empty((4 * n, 20))
-    for k, (points, motion) in enumerate(
-        ((pair.points1[keep], problem.motion1), (pair.points2[keep], problem.motion2))
-    ):
-        # With another focal length or centre, a pixel has the ray that another one has now.
-        rays, jacobian = camera.unproject_with_jacobian(
-            np.concatenate(
-                [
-                    centre + (1.0 - _STEP) * (points - centre),
-                    points,
-                    points - (_STEP, 0.0),
-                    points - (0.0, _STEP),
-                ]
-            )
-        )
-        jacobian[:n] *= 1.0 - _STEP
-        rays[n : 2 * n], jacobian[n : 2 * n] = _lens(camera, 0.0, _STEP).unproject_with_jacobian(
-            points
-        )
-        tau = problem.observations[keep, 18 + k]
-        derotate(
-            rays,
-            jacobian,
-            np.tile(motion.rotations(tau), (4, 1, 1)),
-            camera.line_delay * motion.angular_velocity,
-            out[:, 9 * k : 9 * k + 9],
-        )
-        out[:, 18 + k] = np.tile(tau, 4)
-    return out.reshape(4, n, 20)
-
-
-def _by_rows(
-    pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Derivatives of rays (N, 2, 3, 9), rotated from their row to the middle one, on the left.
-
-    By all deviations but those of the lens. Also the rows' signed shares (N, 2) of the readout
-    after the middle one.
-    """
-    camera, n = pair.camera, np.count_nonzero(keep)
-    half = 0.5 * (camera.row_time_span[1] - camera.row_time_span[0])
-    turns, shares = np.empty((n, 2, 3, _LENS)), np.empty((n, 2))
-    for k, (points, motion) in enumerate(
-        ((pair.points1, problem.motion1), (pair.points2, problem.motion2))
-    ):
-        shares[:, k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
-        turn, tau = turns[:, k], problem.observations[keep, 18 + k]
-        rate, along, acceleration = motion.angular_velocity, tau[:, None, None], np.zeros(3)
-        if half > 0.0 and motion.knot_times is not None:  # of the second half against the first
-            first, last = map(so3.log_so3, motion.rotations([-half, half]))
-            acceleration = (last + first) / half**2
-        later = tau[:, None] * acceleration
-        # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
-        turn[:, :, LIVE.part('axes')] = -along * so3.skew(rate)
-        turn[:, :, _OFFSET] = later
-        turn[:, :, _READOUT] = shares[:, k, None] * rate + middle_share(camera) * later
-        turn[:, :, LIVE.part('gyro_bias')] = -along * pair.R_cam_imu
-        turn[:, :, _SCALE] = tau[:, None] * rate
-    return turns, shares
-
-
-@kernel
-def _displaced(observations: Array, turns: Array, delays: Array) -> Array:
-    """Observations (K, N, 20) with rays rotated by `turns` (M, N, 2, 3) on the left, rows later.
-
-    K or M is 1; `delays` (M, N, 2) [s].
-    """
-    out = np.empty((max(len(observations), len(turns)), *observations.shape[1:]))
-    for m in range(out.shape[0]):
-        given, deviation = m % len(observations), m % len(turns)
-        for i in range(out.shape[1]):
-            for column in range(18):
-                first, image, k = column - column % 3, column // 9, column % 3
-                p, q, turn = (k + 1) % 3, (k + 2) % 3, turns[deviation, i, image]
-                out[m, i, column] = (
-                    observations[given, i, column]
-                    + turn[p] * observations[given, i, first + q]
-                    - turn[q] * observations[given, i, first + p]
-                )
-            for image in range(2):
-                out[m, i, 18 + image] = (
-                    observations[given, i, 18 + image] + delays[deviation, i, image]
-                )
-    return out
-
-
 def middle_share(camera: RollingShutterCamera) -> float:
     """Rows from the stamped to the middle one, as a share of the readout: 0.5, 0 or -0.5."""
     return (0.5 * (camera.height - 1) - camera.reference_row_index) / camera.height
@@ -434,7 +467,11 @@ def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairDa
         )
 
     times, rates = between(first, second)
-    rotation = so3.integrated_rotations(times, rates)[-1]
+    segment = replace(
+        pair.segment,
+        angular_velocities=rates,
+        stamps_ns=gyro.stamps_ns[0] + np.round(times * 1e9).astype(np.int64),
+    )
     motions = []
     for stamped in (first, second):
         rows, row_rates = between(stamped + begin, stamped + end)
@@ -444,14 +481,9 @@ def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairDa
         camera=camera,
         motion1=motions[0],
         motion2=motions[1],
-        R=rotation,
+        R=segment.rotation,
         t=np.full(3, np.nan),
-        gyro_rotation=rotation,
-        segment=replace(
-            pair.segment,
-            angular_velocities=rates,
-            stamps_ns=gyro.stamps_ns[0] + np.round(times * 1e9).astype(np.int64),
-        ),
+        segment=segment,
     )
 
 
