@@ -293,6 +293,32 @@ MODES = {
 }
 
 
+def _knowledge(problem: TwoViewProblem) -> tuple[Knowledge, bool]:
+    """What the IMU knows of a pair for its solvers, and whether that includes gravity."""
+    known = common.no_knowledge()
+    if problem.rotation is not None:
+        known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
+    gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
+    if gravity1 is None or gravity2 is None:
+        return known, False
+    align1 = common.gravity_alignment(gravity1)
+    align2 = common.gravity_alignment(gravity2)
+    return known._replace(align1=align1, align2=align2), True
+
+
+def _sampling(
+    problem: TwoViewProblem, config: EstimatorConfig, order: NDArray[np.int64]
+) -> Sampling:
+    """What is sampled of a pair, as configured."""
+    return Sampling(
+        problem.points,
+        order,
+        (config.threshold * SCALES / problem.focal) ** 2,
+        config.confidence,
+        config.max_iterations,
+    )
+
+
 def draw_hypotheses(
     problem: TwoViewProblem,
     mode: SolverMode,
@@ -309,22 +335,8 @@ def draw_hypotheses(
     Returns the best distinct hypotheses, best first, the number of samples, and whether solvers
     were skipped, since one before them had enough inliers.
     """
-    known = common.no_knowledge()
-    gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
-    has_gravity = gravity1 is not None and gravity2 is not None
-    if gravity1 is not None and gravity2 is not None:
-        known = known._replace(
-            align1=common.gravity_alignment(gravity1), align2=common.gravity_alignment(gravity2)
-        )
-    if problem.rotation is not None:
-        known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
-    sampling = Sampling(
-        problem.points,
-        order,
-        (config.threshold * SCALES / problem.focal) ** 2,
-        config.confidence,
-        config.max_iterations,
-    )
+    known, has_gravity = _knowledge(problem)
+    sampling = _sampling(problem, config, order)
     # All addresses first, so that the first pair compiles the solvers of later pairs, too.
     able = [
         (solver, solver.address)
