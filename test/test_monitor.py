@@ -18,6 +18,7 @@ from rs_relpose_ros.core.deviations import LENS, LIVE, N_DEVIATIONS, PARTS
 from rs_relpose_ros.core.rows import row_states, RowStates
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.arguments import estimate_relative_pose
+from rs_relpose_ros.estimator.covariance import IMAGES
 from rs_relpose_ros.estimator.priors import TwoViewState
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
@@ -275,6 +276,45 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
         assert apart < 0.45 * np.linalg.norm(moved[3:]) + 1e-4
         sigma = math.sqrt(np.trace(pose.covariance[:3, :3]))
         assert np.linalg.norm(moved[:3] - expected[:3]) < sigma
+
+
+@pytest.mark.parametrize('name', ['focal_log', 'distortion'])
+def test_a_deviation_shifts_the_rotation_by_the_images_alone(name):
+    """Against pairs that are exact but for the deviation, at the middle rows."""
+    c = deviation(**{name: {'focal_log': -0.01, 'distortion': 2e-3}[name]})
+
+    def off(start, wrong):
+        """Error of the rotation by the images alone, and J."""
+        pair = pair_data(start, start + 0.3, wrong)
+        pose = estimate_relative_pose(
+            pair.points1,
+            pair.points2,
+            CAMERA,
+            pair.motion1,
+            pair.motion2,
+            pair.segment.rotation,
+            pair.segment.covariance,
+            pair.interval,
+            EstimatorConfig(pixel_sigma=0.3),
+        )
+        images = pose.images.of_rotation()
+        best = Rotation.from_rotvec(-np.linalg.solve(images.information, images.gradient))
+        middle = 0.5 * (CAMERA.readout_time + wrong[READOUT])
+        first, second = (ORIENTATION(at + middle) for at in (start, start + 0.3))
+        found = best * Rotation.from_matrix(images.R)
+        error = (found * (first.inv() * second).inv()).as_rotvec()
+        information = pair_information(replace(pair, R=pose.R, t=pose.t), NONE, NONE)
+        root = np.linalg.cholesky(images.information).T
+        return error, information.images_by_deviation, root
+
+    for start in (0.4, 1.2, 2.0):
+        right, J, root = off(start, NONE)
+        wrong, *_ = off(start, -c)
+        columns = IMAGES.part(name)
+        expected = J[:3, columns] @ c[LIVE.part(name)]
+        # In sigmas: directions that the images hardly determine move far.
+        moved = root @ (wrong - right)
+        assert np.linalg.norm(moved - root @ expected) < 0.7 * np.linalg.norm(moved) + 1.0
 
 
 def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estimate():

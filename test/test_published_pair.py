@@ -19,7 +19,12 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.messages import published_pair as module
 from rs_relpose_ros.messages.outgoing import inlier_records, MATCH_DTYPE
-from rs_relpose_ros.messages.published_pair import PairSynchronizer, PoseChain, published_pair
+from rs_relpose_ros.messages.published_pair import (
+    PairSynchronizer,
+    PoseChain,
+    published_pair,
+    PublishedPair,
+)
 from rs_relpose_ros.pipeline.pair import PairResult
 
 
@@ -84,7 +89,7 @@ def with_images(result: PairResult) -> PairResult:
             pose,
             images=ImageInformation(
                 0.015, pose.R, pose.t, rng.normal(size=6), root.T @ root, rng.normal(size=11)
-            ),
+            ).moved_by(rng.normal(size=(11, 9))),
         ),
     )
 
@@ -131,7 +136,14 @@ def test_what_was_published_is_read_back(results, types, kind):
     ):
         np.testing.assert_array_equal(found, expected)
     assert (pair.images is None) == (pose.images is None)
+    in_process = PublishedPair.of_result(result)
+    assert in_process.current_imu_ns == pair.current_imu_ns
     if pair.images is not None:
+        given = pair.images.by_deviation
+        assert (given is None) == (in_process.images.by_deviation is None)
+        if given is not None:
+            assert given.shape == (len(pair.images.gradient), 9)
+            np.testing.assert_array_equal(given, in_process.images.by_deviation)
         np.testing.assert_allclose(pair.images.R, pose.images.R, atol=1e-15)
         for name in ('row_time', 't', 'velocities', 'information', 'gradient'):
             np.testing.assert_array_equal(getattr(pair.images, name), getattr(pose.images, name))

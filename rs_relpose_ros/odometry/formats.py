@@ -24,9 +24,9 @@ Ints = NDArray[np.int64]
 
 # The rows of an image whose poses a model has: indices into axis 1 of `Model.R`.
 MODEL_ROWS = ('start', 'middle', 'end')
-START = 0  # index of the first row
-MIDDLE = 1  # index of the middle row
-END = 2  # index of the last row
+START = MODEL_ROWS.index('start')
+MIDDLE = MODEL_ROWS.index('middle')
+END = MODEL_ROWS.index('end')
 # From OpenGL's camera axes (x right, y up, z backward) to those of OpenCV.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # OpenCV counts pixels from the centre of the first one, all formats here from its corner.

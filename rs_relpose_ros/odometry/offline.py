@@ -31,7 +31,6 @@ from rs_relpose_ros.odometry.rows import (
     Knot,
     ROWS_FILE,
     RowTrajectory,
-    StampedPose,
     write_tum,
 )
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, OdometryState
@@ -140,9 +139,9 @@ def odometry_into(
     }
     if truth is not None and smoothed:
         metrics |= consistency(published, base.camera(smoothed[0]), truth)
-    write_tum(folder / LIVE_FILE, map(_stamped, live))
-    write_tum(folder / SMOOTHED_FILE, map(_stamped, smoothed))
     write_states(folder / STATES_FILE, published)
+    for name, trajectory in ((LIVE_FILE, live), (SMOOTHED_FILE, smoothed)):
+        write_tum(folder / name, [(one.stamp_ns, one.R, one.position) for one in trajectory])
     if paths:
         given = [sample for _, sample in samples if isinstance(sample, ImuSample)]
         rows = row_trajectory(paths, base, parameters, given, taken)
@@ -172,11 +171,6 @@ def _with_loops(
 
     sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
     return close_loops(estimator, paths, views, sensor, relate)
-
-
-def _stamped(pose: Odometry) -> StampedPose:
-    """Stamp, rotation and position of a keyframe."""
-    return pose.stamp_ns, pose.R, pose.position
 
 
 def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str, Any]:

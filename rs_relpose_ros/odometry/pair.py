@@ -175,14 +175,16 @@ def _by_earlier(by: Array, own: int, body: Body, later: Body, delay: float) -> N
     `own`: its first column. The derivative by the delay is added to the last column.
     """
     back = exp_so3(-delay * body.rate)
-    rotation, place = by[:, own : own + 3].copy(), by[:, own + 3 : own + 6].copy()
+    rotation = by[:, own : own + 3].copy()
+    place = by[:, own + 3 : own + 6].copy()
     velocity = by[:, own + 6 : own + 9].copy()
     to_body = np.ascontiguousarray(later.R.T)
     by[:, own : own + 3] = rotation @ back
     by[:, own + 3 : own + 6] = place @ back
     by[:, own + 6 : own + 9] = velocity + delay * (place @ to_body)
-    by[:, 24] += rotation @ body.rate
-    by[:, 24] += place @ (to_body @ body.velocity) + velocity @ body.acceleration
+    moving = to_body @ body.velocity
+    by[:, _WIDTH - 1] += rotation @ body.rate
+    by[:, _WIDTH - 1] += place @ moving + velocity @ body.acceleration
 
 
 @kernel

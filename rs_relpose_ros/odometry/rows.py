@@ -200,10 +200,8 @@ class RowTrajectory(ArrayFile):
         mount = self._mount(frame)
         times = self._covered(t_ns)
         knots = self.keyframes_ns[:, 1]
-        k = np.searchsorted(knots, times, side='right') - 1
-        k = np.clip(k, 0, len(knots) - 2)
-        step = np.maximum(knots[k + 1] - knots[k], 1)
-        share = ((times - knots[k]) / step)[..., None, None]
+        k, share = _between_stamps(knots, times)
+        share = share[..., None, None]
         covariance = (1.0 - share) * self.covariances[k] + share * self.covariances[k + 1]
         # The position of a frame beside the base also changes with the rotation of the base.
         R, _, _, _ = self._imu_at(times)
@@ -244,11 +242,9 @@ class RowTrajectory(ArrayFile):
         if not times.size:  # SciPy 1.11 has no empty rotations
             nothing = np.zeros((*shape, 3))
             return np.zeros((*shape, 3, 3)), nothing, nothing, nothing
-        k = np.searchsorted(self.stamps_ns, times, side='right') - 1
-        k = np.clip(k, 0, len(self.stamps_ns) - 2)
-        begin, end = self.stamps_ns[k], self.stamps_ns[k + 1]
-        step = np.maximum(end - begin, 1)[..., None] / NANOSECONDS
-        share = (times - begin)[..., None] / NANOSECONDS / step
+        k, share = _between_stamps(self.stamps_ns, times)
+        step = (self.stamps_ns[k + 1] - self.stamps_ns[k])[..., None] / NANOSECONDS
+        share = share[..., None]
         rate1, rate2 = self.rates[k], self.rates[k + 1]
         velocity1, velocity2 = self.velocities[k], self.velocities[k + 1]
         # Between samples rotation and position are cubic polynomials with the values and the
@@ -266,6 +262,14 @@ class RowTrajectory(ArrayFile):
             velocity1 + share * (velocity2 - velocity1),
             rate1 + share * (rate2 - rate1),
         )
+
+
+def _between_stamps(stamps: Stamps, times: Stamps) -> tuple[Stamps, Array]:
+    """Indices (...) of the stamps before times, and the times as shares of the steps from them."""
+    k = np.searchsorted(stamps, times, side='right') - 1
+    k = np.clip(k, 0, len(stamps) - 2)
+    begin, end = stamps[k], stamps[k + 1]
+    return k, np.asarray((times - begin) / np.maximum(end - begin, 1))
 
 
 def _cubic(s: Array, step: Array, way: Array, slope1: Array, slope2: Array) -> Array:

@@ -55,6 +55,9 @@ _LEAST_ROTATION_SIGMA = 1e-5
 _MOST_MATCHES = 120
 # Gyro beyond the rows [s].
 _LEAST_SPAN = 1e-4
+# Sigma of velocities [baselines/s] that matches of a global shutter do not observe: their change
+# by deviations stays finite. [chosen: 10 to 1000 would do: above any velocity]
+_UNKNOWN_VELOCITY = 30.0
 # Steps of a new fit of a pair.
 _NEW_STEPS = 3
 # Places of single deviations in the vector c.
@@ -328,15 +331,19 @@ def _images_by_deviation(
 ) -> Array:
     """Change of pose and velocities by the images alone (11, 9) with the deviations of IMAGES.
 
-    The prior of the velocities stays: where the images do not observe them, their change would be
-    unbounded. Without a direction only the rotation changes.
+    Of the priors only that of the rates within the frames stays, as in `ImageInformation`. Without
+    a direction only the rotation changes.
     """
     of_theta = slice(THETA, THETA + 3)
-    H, mixed = normal.H.copy(), normal.mixed.copy()
-    H[of_theta, of_theta] -= information
+    of_priors, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    priors.add_priors(linear.state, linear.prior, of_priors, gradient)
+    H, mixed = normal.H - of_priors, normal.mixed.copy()
+    H[POSE:, POSE:] += linear.prior.rate_weight * np.eye(PARAMETERS - POSE)
     mixed[of_theta] += information @ linear.gyro
     moved = np.zeros((POSE, mixed.shape[1]))
     if has_direction:
+        velocities = slice(TANGENT + 2, POSE)
+        H[velocities, velocities] += _UNKNOWN_VELOCITY**-2 * np.eye(6)
         moved[:] = -(inverse(H) @ mixed)[:POSE]
     else:
         moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], mixed[of_theta])
