@@ -74,7 +74,11 @@ class Doubts:
         """R (3, 3) from the body to the camera."""
         return exp_so3(self.mount(d)[0]) @ self._R_cam_body
 
-    def named(self, d: Array, covariance: Array) -> dict[str, tuple[list[float], list[float]]]:
+    def named(
+        self,
+        d: Array,
+        covariance: Array,
+    ) -> dict[str, tuple[list[float], list[float]]]:
         """Values and sigmas of the unknown deviations by name."""
         values, sigmas = np.zeros(IMAGES.size), np.zeros(IMAGES.size)
         values[self.active] = d[3:]

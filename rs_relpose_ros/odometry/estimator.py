@@ -201,7 +201,12 @@ class OdometryEstimator:
     `keep`: whether all of them are kept for `smoothed`.
     """
 
-    def __init__(self, parameters: Parameters, *, keep: bool = False) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        keep: bool = False,
+    ) -> None:
         self._parameters, self._keep = parameters, keep
         self._config, self._imu = parameters.odometry, parameters.imu
         self._R_cam_body = parameters.sensor.R_cam_imu
@@ -360,7 +365,12 @@ class OdometryEstimator:
         warnings, self._warnings = self._warnings, []
         return warnings
 
-    def take(self, *, end: bool = False, most: int | None = None) -> list[Odometry]:
+    def take(
+        self,
+        *,
+        end: bool = False,
+        most: int | None = None,
+    ) -> list[Odometry]:
         """Finished keyframes, of at most `most` pairs; with `end`, no more input follows."""
         out: list[Odometry] = []
         while self._waiting and most != 0:
@@ -495,7 +505,12 @@ class OdometryEstimator:
         self.counts['calibration contradicted'] += 1
         return True
 
-    def _add(self, run: _Run, pair: PublishedPair, interval: ImuInterval) -> None:
+    def _add(
+        self,
+        run: _Run,
+        pair: PublishedPair,
+        interval: ImuInterval,
+    ) -> None:
         """Add a keyframe at the pair's current image, and the pair if it agrees with the path."""
         at_ns = pair.current_imu_ns
         # Pairs that deviate together are wrong together: their covariance is too small by that.
@@ -523,7 +538,11 @@ class OdometryEstimator:
         if run.published:
             self._change(OdometryState.TRACKING, '', at_ns)
 
-    def _reject(self, run: _Run, pair: PublishedPair) -> None:
+    def _reject(
+        self,
+        run: _Run,
+        pair: PublishedPair,
+    ) -> None:
         """Count a pair that contradicts the path, which ends if too many do."""
         self.counts['contradicting'] += 1
         self._unusable_ns = pair.current_imu_ns
@@ -585,7 +604,11 @@ class OdometryEstimator:
         elif heading > self._config.max_heading_sigma:
             self._end(f'the heading is known to {heading:.2f} rad', imu_ns)
 
-    def _due(self, run: _Run, imu_ns: int) -> float:
+    def _due(
+        self,
+        run: _Run,
+        imu_ns: int,
+    ) -> float:
         """Age of the newest usable pair [s] up to which the next one is not missing."""
         silent_ns = imu_ns - self._arrived_ns
         if self._unusable_ns > run.observed_ns:
@@ -625,7 +648,11 @@ class OdometryEstimator:
         )
 
     def _start(
-        self, pair: PublishedPair, interval: ImuInterval, path_end: _PathEnd, at_rest: bool
+        self,
+        pair: PublishedPair,
+        interval: ImuInterval,
+        path_end: _PathEnd,
+        at_rest: bool,
     ) -> KeyframeState:
         """The body at the pair's reference, with the covariance of a start."""
         assert self.base is not None and pair.images is not None
@@ -721,7 +748,11 @@ class OdometryEstimator:
             self._run = None
         return False
 
-    def _publish(self, run: _Run, start: StartReport) -> None:
+    def _publish(
+        self,
+        run: _Run,
+        start: StartReport,
+    ) -> None:
         """Start to publish a run."""
         run.published = True
         if not run.at_rest:
@@ -743,7 +774,11 @@ class OdometryEstimator:
         if self._wrong_starts == _WRONG_STARTS:
             self.reason = _CONTRADICTION
 
-    def _end(self, reason: str, imu_ns: int) -> None:
+    def _end(
+        self,
+        reason: str,
+        imu_ns: int,
+    ) -> None:
         """End the run; the next one continues from its end."""
         run, self._run = self._run, None
         if run is not None and run.published:
@@ -754,7 +789,12 @@ class OdometryEstimator:
             self._doubts_covariance = newest.covariance[DOUBTS, DOUBTS]
             self._change(OdometryState.LOST, reason, imu_ns)
 
-    def _change(self, state: OdometryState, reason: str, imu_ns: int) -> None:
+    def _change(
+        self,
+        state: OdometryState,
+        reason: str,
+        imu_ns: int,
+    ) -> None:
         """Enter a state; a message and an interval where it is another one."""
         self.reason = reason
         if state is self.state:
@@ -792,7 +832,12 @@ class OdometryEstimator:
         return newest.doubts, newest.covariance[DOUBTS, DOUBTS]
 
     def _odometry(
-        self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int, imu_ns: int
+        self,
+        run: _Run,
+        state: KeyframeState,
+        rate: Array,
+        stamp_ns: int,
+        imu_ns: int,
     ) -> Odometry:
         """The base, or the camera without one, of the body at a time; `rate` (3,) of the gyro."""
         base, first_R = self.base, self._first_R
@@ -830,12 +875,8 @@ class OdometryEstimator:
         to_twist[3:] -= skew(C @ rate) @ base.R @ by_axes
         by_rate = to_twist[:, GYRO_BIAS] * self._imu.gyro_noise_density * _RATE_NOISE
         twist_covariance = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
-        # A later start has position and heading from the end of the path before.
-        up = np.array([0.0, 0.0, 1.0])
-        from_end = state.position + state.R @ c - run.path_end.position
-        by_heading = run.path_end.heading_sigma * np.concatenate([skew(up) @ from_end, up])
-        covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
-        covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
+        of_body = to_world @ state.covariance @ to_world.T
+        covariance = of_body + _of_path_end(run.path_end, state.position + state.R @ c)
         return Odometry(
             stamp_ns=stamp_ns,
             imu_ns=imu_ns,
@@ -851,6 +892,15 @@ class OdometryEstimator:
         )
 
 
+def _of_path_end(path_end: _PathEnd, position: Array) -> Array:
+    """Covariance (6, 6) of a pose at a position (3,) by the end of the path before."""
+    up = np.array([0.0, 0.0, 1.0])
+    turned = np.concatenate([skew(up) @ (position - path_end.position), up])
+    covariance = path_end.heading_sigma**2 * np.outer(turned, turned)
+    covariance[:3, :3] += path_end.position_sigma**2 * np.eye(3)
+    return np.asarray(covariance)
+
+
 def _variances(state: KeyframeState) -> tuple[float, float]:
     """Variances of the position (its length) and of the heading."""
     up, covariance = state.R[2], state.covariance[POSE, POSE]
@@ -858,7 +908,11 @@ def _variances(state: KeyframeState) -> tuple[float, float]:
     return float(np.trace(covariance[3:, 3:])), float(of_heading)
 
 
-def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
+def _levelled(
+    force: Array,
+    path_end: _PathEnd,
+    axes: Array,
+) -> Array:
     """Rotation (3, 3) from the body to the world, by the specific force at rest.
 
     `axes` (3, 3): from the body to the axes that keep their heading.

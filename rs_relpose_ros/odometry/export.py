@@ -155,7 +155,11 @@ class _Frames:
     order: Ints = field(init=False)  # of the observations, by keyframes
     colors: NDArray[np.uint8] = field(init=False)
 
-    def read(self, bag: Bag, topics: SensorTopics) -> None:
+    def read(
+        self,
+        bag: Bag,
+        topics: SensorTopics,
+    ) -> None:
         """Go through a bag; InputError if no image can be exported."""
         loop = FrameLoop(self.parameters, self.unroller, offline=True, colors=True)
         intake = Intake(loop.sequencer, self.parameters)
@@ -178,7 +182,11 @@ class _Frames:
             'that of this bag?'
         )
 
-    def leave_out(self, stamp_ns: int, reason: str) -> None:
+    def leave_out(
+        self,
+        stamp_ns: int,
+        reason: str,
+    ) -> None:
         """Count an image that is not exported."""
         self.left_out.append({'stamp_ns': stamp_ns, 'reason': reason})
 
@@ -210,7 +218,10 @@ class _Frames:
             )
 
     def _take_colors(
-        self, frame: Frame[GlobalShutterFrame], points: MapPoints, observed: Ints
+        self,
+        frame: Frame[GlobalShutterFrame],
+        points: MapPoints,
+        observed: Ints,
     ) -> None:
         """Give points the colours of the pixels where a frame shows them."""
         if not len(observed):
@@ -233,7 +244,11 @@ class _Frames:
             self.next_ns = at_ns + step
         return True
 
-    def _observations(self, points: MapPoints, at_ns: int) -> Ints:
+    def _observations(
+        self,
+        points: MapPoints,
+        at_ns: int,
+    ) -> Ints:
         """Indices of the observations of points in an image."""
         keyframes = points.observations.keyframes_ns
         window = [at_ns - _SAME_NS, at_ns + _SAME_NS + 1]
@@ -313,7 +328,11 @@ def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
     return np.asarray(values[:, channels], dtype=np.uint8)
 
 
-def _link(source: Path, target: Path, data: bytes) -> None:
+def _link(
+    source: Path,
+    target: Path,
+    data: bytes,
+) -> None:
     """Link an image to the one that is kept, which is written if it is new."""
     try:
         if not source.exists():
@@ -345,7 +364,12 @@ def _published(sensor: Sensor) -> RollingShutterCamera:
     )
 
 
-def _shown(model: Model, rows: RowTrajectory, k: Ints, pixels: Array) -> Array:
+def _shown(
+    model: Model,
+    rows: RowTrajectory,
+    k: Ints,
+    pixels: Array,
+) -> Array:
     """Pixels (N, 2) of derotated images of pixels of the frames k (N,)."""
     R, _ = rows.pose(model.times_of(k, pixels[:, 1]))
     in_world = rotated(R, model.camera.unproject(pixels))
@@ -366,7 +390,10 @@ def derotated(model: Model, rows: RowTrajectory) -> Model:
 
 
 def _deviations(
-    model: Model, exported: Model, rows: RowTrajectory, chosen: Format
+    model: Model,
+    exported: Model,
+    rows: RowTrajectory,
+    chosen: Format,
 ) -> tuple[dict[str, float] | None, dict[str, float] | None]:
     """Distances in the images; None without points.
 
@@ -397,7 +424,11 @@ def _spread(differences: Array) -> dict[str, float]:
     }
 
 
-def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
+def _draw(
+    model: Model,
+    rows: RowTrajectory,
+    path: Path,
+) -> None:
     """Path with its loops from above, the images' cameras and the points."""
     picture = Figure(figsize=(8.0, 8.0), dpi=110, layout='constrained')
     axes = picture.subplots()

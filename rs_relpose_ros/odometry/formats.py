@@ -77,7 +77,11 @@ class Model:
         poses[..., 3, 3] = 1.0
         return poses
 
-    def times_of(self, k: Ints, rows: Array) -> Ints:
+    def times_of(
+        self,
+        k: Ints,
+        rows: Array,
+    ) -> Ints:
         """Times (N,) [ns] of rows of the frames k (N,), limited to those of the image."""
         begin, _, end = self.times_ns[k].T
         first_row = 0.0 if self.reads_down else self.camera.height - 1.0
@@ -120,7 +124,12 @@ def _share(model: Model, rows: Array) -> Array:
     return share if model.reads_down else 1.0 - share
 
 
-def _slerp_back(model: Model, k: Ints, share: Array, vectors: Array) -> Array:
+def _slerp_back(
+    model: Model,
+    k: Ints,
+    share: Array,
+    vectors: Array,
+) -> Array:
     """Rotate vectors (N, 3) to the camera, which turns at a constant rate from start to end."""
     first = Rotation.from_matrix(model.R[k, START])
     last = Rotation.from_matrix(model.R[k, END])
@@ -129,7 +138,12 @@ def _slerp_back(model: Model, k: Ints, share: Array, vectors: Array) -> Array:
     return np.asarray(at_share.inv().apply(vectors))
 
 
-def lerp_of_position(model: Model, k: Ints, points: Array, rows: Array) -> Array:
+def lerp_of_position(
+    model: Model,
+    k: Ints,
+    points: Array,
+    rows: Array,
+) -> Array:
     """Slerp of the rotation, linear position of the camera in the world."""
     share = _share(model, rows)
     start = model.positions[k, START]
@@ -137,7 +151,12 @@ def lerp_of_position(model: Model, k: Ints, points: Array, rows: Array) -> Array
     return _slerp_back(model, k, share, points - start - share[:, None] * way)
 
 
-def lerp_of_translation(model: Model, k: Ints, points: Array, rows: Array) -> Array:
+def lerp_of_translation(
+    model: Model,
+    k: Ints,
+    points: Array,
+    rows: Array,
+) -> Array:
     """Slerp of the rotation, linear translation from world to camera; the same in a whole row."""
     share = _share(model, np.floor(rows + 0.5))
     start = -rotated_back(model.R[k, START], model.positions[k, START])
@@ -146,12 +165,22 @@ def lerp_of_translation(model: Model, k: Ints, points: Array, rows: Array) -> Ar
     return np.asarray(turned + start + share[:, None] * (end - start))
 
 
-def middle(model: Model, k: Ints, points: Array, rows: Array) -> Array:
+def middle(
+    model: Model,
+    k: Ints,
+    points: Array,
+    rows: Array,
+) -> Array:
     """One pose per image."""
     return rotated_back(model.R[k, MIDDLE], points - model.positions[k, MIDDLE])
 
 
-def velocity_of_pixel(model: Model, k: Ints, points: Array, rows: Array) -> Array:
+def velocity_of_pixel(
+    model: Model,
+    k: Ints,
+    points: Array,
+    rows: Array,
+) -> Array:
     """Constant velocity in the undistorted image, whose rows have the times of the original's."""
     camera = model.camera
     local = middle(model, k, points, rows)
@@ -170,14 +199,25 @@ def velocity_of_pixel(model: Model, k: Ints, points: Array, rows: Array) -> Arra
 def path(rows: RowTrajectory) -> Placement:
     """The poses of the trajectory itself."""
 
-    def place(model: Model, k: Ints, points: Array, at: Array) -> Array:
+    def place(
+        model: Model,
+        k: Ints,
+        points: Array,
+        at: Array,
+    ) -> Array:
         R, p = rows.pose(model.times_of(k, at))
         return rotated_back(R, points - p)
 
     return place
 
 
-def projected(place: Placement, model: Model, k: Ints, points: Array, rows: Array) -> Array:
+def projected(
+    place: Placement,
+    model: Model,
+    k: Ints,
+    points: Array,
+    rows: Array,
+) -> Array:
     """Pixels (N, 2) of points at the poses of their own rows; `rows` (N,): first guesses."""
     pixels = np.column_stack([rows, rows])
     for _ in range(_ROW_ROUNDS):
@@ -314,7 +354,10 @@ def _focal_and_centre(camera: RollingShutterCamera) -> tuple[float, float, float
 
 
 def _write_transforms(
-    model: Model, folder: Path, more: Mapping[str, Any], of_frames: Mapping[str, Array]
+    model: Model,
+    folder: Path,
+    more: Mapping[str, Any],
+    of_frames: Mapping[str, Array],
 ) -> None:
     """The transforms.json of instant-ngp and nerfstudio, with entries of their own.
 

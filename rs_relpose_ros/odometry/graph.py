@@ -179,7 +179,11 @@ class _Noise:
         self._log = _LIKELY
         self._read()
 
-    def observe(self, innovation: _Innovation, seconds: float) -> None:
+    def observe(
+        self,
+        innovation: _Innovation,
+        seconds: float,
+    ) -> None:
         """Use an innovation; `seconds`: since the one before."""
         more = (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None]
         covariances = innovation.covariance + more * innovation.by_accelerometer
@@ -206,7 +210,12 @@ class KeyframeGraph:
     """
 
     def __init__(
-        self, start: KeyframeState, unknown: Doubts, parameters: Parameters, *, keep: bool = False
+        self,
+        start: KeyframeState,
+        unknown: Doubts,
+        parameters: Parameters,
+        *,
+        keep: bool = False,
     ) -> None:
         self._doubts, self._imu, self._config = unknown, parameters.imu, parameters.odometry
         self._R_cam_body = parameters.sensor.R_cam_imu
@@ -292,7 +301,11 @@ class KeyframeGraph:
         self._update(factors, values, j, self._seconds + step, steps)
         return innovation
 
-    def _variance(self, innovation: float, gate: float) -> float:
+    def _variance(
+        self,
+        innovation: float,
+        gate: float,
+    ) -> float:
         """Variance of a pair by that of its images.
 
         Without a gate, at a start, the misfit shows what is wrong. Later the variance is no
@@ -351,7 +364,11 @@ class KeyframeGraph:
 
     # -- inside ------------------------------------------------------------------------------
 
-    def _closed(self, loops: Sequence[Loop], values: Any) -> tuple[Any, Any]:
+    def _closed(
+        self,
+        loops: Sequence[Loop],
+        values: Any,
+    ) -> tuple[Any, Any]:
         """The record with loops, optimised."""
         assert self._record is not None
         graph = gtsam.NonlinearFactorGraph(self._record[0])
@@ -359,7 +376,12 @@ class KeyframeGraph:
             graph.add(self._pair_factor(*loop, robust=True))
         return graph, _optimized(graph, values)
 
-    def _misfit(self, loop: Loop, values: Any, marginals: Any = None) -> float:
+    def _misfit(
+        self,
+        loop: Loop,
+        values: Any,
+        marginals: Any = None,
+    ) -> float:
         """Chi squared of a loop by its bound; `marginals`: of a path without it."""
         factor = self._pair_factor(*loop)
         _, e = factor.linearize(values).jacobian()
@@ -371,7 +393,11 @@ class KeyframeGraph:
             S += A @ _joint(marginals, list(factor.keys())) @ A.T
         return float(e @ np.linalg.solve(S, e)) / _loop_bound(len(e)) ** 2
 
-    def _predicted_loop(self, loop: Loop, values: Any) -> Loop:
+    def _predicted_loop(
+        self,
+        loop: Loop,
+        values: Any,
+    ) -> Loop:
         """The same of the poses of a path."""
         images = loop.pair.images
         assert images is not None
@@ -429,7 +455,11 @@ class KeyframeGraph:
         noise[:_OWN, :_OWN] = back @ back.T
         return by, noise
 
-    def _innovation(self, pim: Any, of_pair: Any) -> _Innovation:
+    def _innovation(
+        self,
+        pim: Any,
+        of_pair: Any,
+    ) -> _Innovation:
         """The errors of a pair factor with their covariance, given all before it."""
         by, noise = self._linearised(pim)
         H, e = of_pair.linearize(self._ahead).jacobian()
@@ -486,7 +516,11 @@ class KeyframeGraph:
             by_images = images.by_deviation[:, unknown.active]
         keys = x1, v1, x2, v2, common = [X(i), V(i), X(j), V(j), L(0)]
 
-        def error(_: Any, values: Any, jacobians: Any) -> Array:
+        def error(
+            _: Any,
+            values: Any,
+            jacobians: Any,
+        ) -> Array:
             d = values.atVector(common)
             axes, delay = unknown.mount(d)
             mount = Mount(R_cam_body, d[doubts.ARM].copy(), axes, delay)
@@ -505,11 +539,19 @@ class KeyframeGraph:
 
         return gtsam.CustomFactor(noise, keys, error)
 
-    def _still_factor(self, i: int, j: int) -> Any:
+    def _still_factor(
+        self,
+        i: int,
+        j: int,
+    ) -> Any:
         """The camera keeps its position under any rotation of the body."""
         unknown = len(self._doubts.active)
 
-        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+        def error(
+            factor: Any,
+            values: Any,
+            jacobians: Any,
+        ) -> Array:
             first, second, common = factor.keys()
             pose1, pose2 = values.atPose3(first), values.atPose3(second)
             R1, R2 = pose1.rotation().matrix(), pose2.rotation().matrix()
@@ -527,7 +569,12 @@ class KeyframeGraph:
         return gtsam.CustomFactor(noise, [X(i), X(j), L(0)], error)
 
     def _update(
-        self, factors: Any, values: Any, newest: int, seconds: float, steps: int = 1
+        self,
+        factors: Any,
+        values: Any,
+        newest: int,
+        seconds: float,
+        steps: int = 1,
     ) -> None:
         """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
         with _solving():
@@ -581,7 +628,11 @@ def _solving() -> Iterator[None]:
         raise GraphError(f'the graph cannot be solved: {first_line}') from error
 
 
-def _state(values: Any, marginals: Any, k: int) -> KeyframeState:
+def _state(
+    values: Any,
+    marginals: Any,
+    k: int,
+) -> KeyframeState:
     """A keyframe with its covariance."""
     pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
     return KeyframeState(
@@ -601,7 +652,11 @@ def _joint(marginals: Any, keys: list[int]) -> Array:
     return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
-def _imu_factor(i: int, j: int, pim: Any) -> Any:
+def _imu_factor(
+    i: int,
+    j: int,
+    pim: Any,
+) -> Any:
     return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
 
 

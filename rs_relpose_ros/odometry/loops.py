@@ -44,7 +44,11 @@ _GRID = (8, 6)
 _LEAST_PARALLAX = 2.0
 
 
-def scene_depth(path: Sequence[Odometry], views: Views, focal_length: float) -> float:
+def scene_depth(
+    path: Sequence[Odometry],
+    views: Views,
+    focal_length: float,
+) -> float:
     """Median distance of the scene [m]; NaN without any."""
     depths = []
     for one, two in pairwise(path):
@@ -56,7 +60,9 @@ def scene_depth(path: Sequence[Odometry], views: Views, focal_length: float) -> 
 
 
 def proposed_loops(
-    path: Sequence[Odometry], depth: float, camera: RollingShutterCamera
+    path: Sequence[Odometry],
+    depth: float,
+    camera: RollingShutterCamera,
 ) -> list[tuple[int, int]]:
     """Keyframes far apart in time with a common view, by a path of the camera.
 
@@ -82,7 +88,10 @@ def proposed_loops(
 
 
 def _common_views(
-    earlier: Sequence[Odometry], pose: Odometry, depth: float, camera: RollingShutterCamera
+    earlier: Sequence[Odometry],
+    pose: Odometry,
+    depth: float,
+    camera: RollingShutterCamera,
 ) -> list[tuple[float, int]]:
     """Earlier keyframes that share a large part of a view: the share, and their position."""
     near = [

@@ -92,7 +92,10 @@ class MapPoints:
 
 
 def triangulated(
-    tracks: KeyframeObservations, rows: RowTrajectory, sensor: Sensor, most: int
+    tracks: KeyframeObservations,
+    rows: RowTrajectory,
+    sensor: Sensor,
+    most: int,
 ) -> MapPoints:
     """At most so many points, those whose depth is known best, each with 3 observations or more.
 

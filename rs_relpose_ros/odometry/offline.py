@@ -124,8 +124,7 @@ def odometry_into(
     smoothed = [keyframe for path in paths for _, keyframe in path]
     warnings = [notice.text for notice in estimator.warnings()]
     truth = read_truth(bag, topics)
-    # The ground truth is that of the camera.
-    base = estimator.base or Base()
+    base = estimator.base or Base()  # the ground truth is that of the camera
     published = [base.camera(state) for state in states.published]
     drawn = {
         name: path_of([base.camera(pose) for pose in trajectory], truth)
@@ -140,17 +139,26 @@ def odometry_into(
     if truth is not None and smoothed:
         metrics |= consistency(published, base.camera(smoothed[0]), truth)
     write_states(folder / STATES_FILE, published)
-    for name, trajectory in ((LIVE_FILE, live), (SMOOTHED_FILE, smoothed)):
-        write_tum(folder / name, [(one.stamp_ns, one.R, one.position) for one in trajectory])
+    _write_keyframes(folder / LIVE_FILE, live)
+    _write_keyframes(folder / SMOOTHED_FILE, smoothed)
     if paths:
         given = [sample for _, sample in samples if isinstance(sample, ImuSample)]
-        rows = row_trajectory(paths, base, parameters, given, taken)
-        rows.save(folder / ROWS_FILE)
+        _write_rows(folder, row_trajectory(paths, base, parameters, given, taken), rate)
         KeyframeObservations.merged(observed).save(folder / TRACKS_FILE)
-        if rate:
-            write_tum(folder / RATE_FILE, camera_poses(rows, rate))
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
+
+
+def _write_keyframes(path: Path, keyframes: Sequence[Odometry]) -> None:
+    """Write the poses of keyframes in TUM's format."""
+    write_tum(path, [(one.stamp_ns, one.R, one.position) for one in keyframes])
+
+
+def _write_rows(folder: Path, rows: RowTrajectory, rate: float) -> None:
+    """Write poses at any time, and with a rate [Hz] also in TUM's format."""
+    rows.save(folder / ROWS_FILE)
+    if rate:
+        write_tum(folder / RATE_FILE, camera_poses(rows, rate))
 
 
 def _with_loops(
@@ -231,7 +239,12 @@ def row_trajectory(
     )
 
 
-def _knot(state: KeyframeState, keyframe: Odometry, base: Base, arm: Array) -> Knot:
+def _knot(
+    state: KeyframeState,
+    keyframe: Odometry,
+    base: Base,
+    arm: Array,
+) -> Knot:
     """A keyframe of a trajectory of rows, whose `arm` is that of the last path.
 
     The position of the camera is kept: the arm of an earlier path may differ.
@@ -251,7 +264,11 @@ def _knot(state: KeyframeState, keyframe: Odometry, base: Base, arm: Array) -> K
 class PublishedStates:
     """States between keyframes, as odometry_node publishes them on ``~/odometry``."""
 
-    def __init__(self, estimator: OdometryEstimator, rate: float) -> None:
+    def __init__(
+        self,
+        estimator: OdometryEstimator,
+        rate: float,
+    ) -> None:
         """`rate` [Hz]: of the states; 0 for the keyframes alone."""
         self._estimator = estimator
         self._path = ContinuousPath(estimator.propagated)
@@ -259,7 +276,11 @@ class PublishedStates:
         self._next_ns = 0
         self.published: list[Odometry] = []
 
-    def after(self, arrives_ns: int, keyframes: Sequence[Odometry]) -> None:
+    def after(
+        self,
+        arrives_ns: int,
+        keyframes: Sequence[Odometry],
+    ) -> None:
         """Publish what is due after a sample, and the keyframes that it has finished."""
         due = [self._estimator.newest_ns] if arrives_ns >= self._next_ns else []
         if not self._step_ns:
@@ -357,7 +378,9 @@ def write_states(path: Path, states: Iterable[Odometry]) -> None:
 
 
 def consistency(
-    states: Sequence[Odometry], origin: Odometry, truth: TrueTrajectory
+    states: Sequence[Odometry],
+    origin: Odometry,
+    truth: TrueTrajectory,
 ) -> dict[str, dict[str, float] | None]:
     """`nees` and `beyond` of published states, for summary.json; None where no truth covers them.
 
@@ -379,7 +402,10 @@ def consistency(
 
 
 def _squared_errors(
-    state: Odometry, origin: Odometry, turn: Array, truth: TrueTrajectory
+    state: Odometry,
+    origin: Odometry,
+    turn: Array,
+    truth: TrueTrajectory,
 ) -> tuple[float, float, float]:
     """Chi squared of position, rotation and velocity; `turn`: from the truth's world to ours."""
     R = turn @ truth.rotation(state.imu_ns)
@@ -459,7 +485,11 @@ def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> Com
     return ComparedPath([pose.imu_ns for pose in covered], moved, true, errors)
 
 
-def _relative_errors(poses: Sequence[Odometry], way: Array, truth: TrueTrajectory) -> list[float]:
+def _relative_errors(
+    poses: Sequence[Odometry],
+    way: Array,
+    truth: TrueTrajectory,
+) -> list[float]:
     """Errors of the translation over segments of 1 m, by their length; `way` (N,) [m]: true."""
     relative = []
     for i, pose in enumerate(poses):

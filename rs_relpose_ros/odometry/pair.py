@@ -110,7 +110,13 @@ class Body(NamedTuple):
     acceleration: Array  # (3,) [m/s^2] in the world
 
     @classmethod
-    def of(cls, pose: Any, velocity: Array, rate: Array, force: Array) -> Body:
+    def of(
+        cls,
+        pose: Any,
+        velocity: Array,
+        rate: Array,
+        force: Array,
+    ) -> Body:
         """From a ``gtsam.Pose3`` and the specific force (3,) in the axes of the body."""
         matrix = pose.matrix()
         R = matrix[:3, :3].copy()
@@ -169,7 +175,13 @@ def _moved(body: Body, delay: float) -> Body:
 
 
 @kernel
-def _by_earlier(by: Array, own: int, body: Body, later: Body, delay: float) -> None:
+def _by_earlier(
+    by: Array,
+    own: int,
+    body: Body,
+    later: Body,
+    delay: float,
+) -> None:
     """Turn derivatives (11, 25) by a body after the delay into those by the body before it.
 
     `own`: its first column. The derivative by the delay is added to the last column.
@@ -188,7 +200,12 @@ def _by_earlier(by: Array, own: int, body: Body, later: Body, delay: float) -> N
 
 
 @kernel
-def deviations(first: Body, second: Body, mount: Mount, measured: Measured) -> tuple[Array, Array]:
+def deviations(
+    first: Body,
+    second: Body,
+    mount: Mount,
+    measured: Measured,
+) -> tuple[Array, Array]:
     """Deviations (11,) of a measured pair from two bodies, and their derivatives (11, 25)."""
     C, c = exp_so3(mount.axes) @ mount.R, mount.arm
     body1, body2 = first, second

@@ -172,7 +172,11 @@ class RowTrajectory(ArrayFile):
         last = self.spans[k, 1]
         return np.asarray((k >= 0) & (times <= last))
 
-    def pose(self, t_ns: ArrayLike, frame: str = CAMERA) -> tuple[Array, Array]:
+    def pose(
+        self,
+        t_ns: ArrayLike,
+        frame: str = CAMERA,
+    ) -> tuple[Array, Array]:
         """R (..., 3, 3) from a frame to the world, and its position (..., 3) [m].
 
         Raises
@@ -184,7 +188,11 @@ class RowTrajectory(ArrayFile):
         R, position, _, _ = self._imu_at(self._covered(t_ns))
         return R @ mount[:, :3], position + R @ mount[:, 3]
 
-    def velocity(self, t_ns: ArrayLike, frame: str = CAMERA) -> tuple[Array, Array]:
+    def velocity(
+        self,
+        t_ns: ArrayLike,
+        frame: str = CAMERA,
+    ) -> tuple[Array, Array]:
         """Linear [m/s] and angular velocity [rad/s] (..., 3), in the axes of the frame itself."""
         mount = self._mount(frame)
         R, _, velocity, rate = self._imu_at(self._covered(t_ns))
@@ -192,7 +200,11 @@ class RowTrajectory(ArrayFile):
         moved = np.einsum('...ji,...j->...i', R @ axes, velocity)
         return moved + np.cross(rate, arm) @ axes, rate @ axes
 
-    def covariance(self, t_ns: ArrayLike, frame: str = CAMERA) -> Array:
+    def covariance(
+        self,
+        t_ns: ArrayLike,
+        frame: str = CAMERA,
+    ) -> Array:
         """Covariance (..., 6, 6) of position [m] and rotation [rad], in the axes of the world.
 
         It is that of the keyframes, linear in between. The mounting is taken as exact.
@@ -272,7 +284,13 @@ def _between_stamps(stamps: Stamps, times: Stamps) -> tuple[Stamps, Array]:
     return k, np.asarray((times - begin) / np.maximum(end - begin, 1))
 
 
-def _cubic(s: Array, step: Array, way: Array, slope1: Array, slope2: Array) -> Array:
+def _cubic(
+    s: Array,
+    step: Array,
+    way: Array,
+    slope1: Array,
+    slope2: Array,
+) -> Array:
     """The cubic polynomial from 0 to `way` at s = 0 to 1 with these slopes, per `step` [s]."""
     rest1 = step * slope1 - way
     rest2 = step * slope2 - way
@@ -301,7 +319,11 @@ def _cut(columns: _Columns, part: slice) -> _Columns:
     return stamps[part], quats[part], positions[part], velocities[part], rates[part]
 
 
-def _between(one: Knot, two: Knot, interval: ImuInterval) -> _Columns:
+def _between(
+    one: Knot,
+    two: Knot,
+    interval: ImuInterval,
+) -> _Columns:
     """Columns of the samples from one keyframe up to the next one."""
     seconds = interval.seconds[:, None]
     duration = interval.duration

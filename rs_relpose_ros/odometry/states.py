@@ -60,7 +60,11 @@ class Base(NamedTuple):
     position: Array = np.zeros(3)  # of the camera [m]
 
     @classmethod
-    def of(cls, frame_id: str, base_to_camera: Sequence[float]) -> Base:
+    def of(
+        cls,
+        frame_id: str,
+        base_to_camera: Sequence[float],
+    ) -> Base:
         """From x y z, quaternion x y z w of the camera in the base."""
         R = Rotation.from_quat(base_to_camera[3:]).as_matrix()
         return cls(frame_id, R, np.array(base_to_camera[:3]))
@@ -150,7 +154,11 @@ class ContinuousPath:
         )
         return self._last
 
-    def _corrected_by(self, last: Odometry, state: Odometry) -> Array:
+    def _corrected_by(
+        self,
+        last: Odometry,
+        state: Odometry,
+    ) -> Array:
         """Offset (6,) of the last published state from the path as it is known now."""
         before = self._propagated(last.imu_ns)
         if before is not None:
