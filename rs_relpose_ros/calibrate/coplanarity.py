@@ -321,6 +321,22 @@ def _add_match(J: Array, r: float, weight: float, gradient: Array, hessian: Arra
             hessian[i, j] += weight * J[i] * J[j]
 
 
+@inlined_kernel
+def _own_motion(Q_middle: Array, own: Array) -> tuple[Vector, Vector, Array, Array]:
+    """Direction and bend of a pair, and half of its turn forwards (frame 2) and back (frame 1)."""
+    half = so3.exp_so3(0.5 * (Q_middle @ own[6:]))
+    straight, bend = rotated(Q_middle, own[:3]), rotated(Q_middle, own[3:6])
+    return straight, bend, half, np.ascontiguousarray(half.T)
+
+
+@inlined_kernel
+def _add_own(J: Array, by_b: Vector, tangent: Array, rows: float) -> None:
+    """Write the derivatives by direction and bend of the pair."""
+    J[DIRECTION], J[DIRECTION + 1] = dot(tangent[0], by_b), dot(tangent[1], by_b)
+    for i in range(3):
+        J[BEND + i] = rows * by_b[i]
+
+
 @kernel
 def accumulate(
     problem: Problem,
@@ -344,11 +360,7 @@ def accumulate(
     for p in range(len(problem.middle)):
         middle, covariates = problem.middle[p], problem.covariates[:, p]
         Q_middle = path.rotations[middle]
-        straight = rotated(Q_middle, unknowns.own[p, :3])
-        bend = rotated(Q_middle, unknowns.own[p, 3:6])
-        # Half of `turn` forwards in frame 2, and half of it backwards in frame 1.
-        half = so3.exp_so3(0.5 * (Q_middle @ unknowns.own[p, 6:]))
-        half_back = np.ascontiguousarray(half.T)
+        straight, bend, half, half_back = _own_motion(Q_middle, unknowns.own[p])
         starts = _starts(problem, p, parameters)
         k1 = k2 = middle
         per_noise2 = 1.0 / unknowns.noise[p] ** 2
@@ -382,10 +394,7 @@ def accumulate(
             _add_view(J, by_2, sight2, row2, covariates[1], 0.5, Q_middle)
             _add_lens(J, problem, 0, n, by_m1, c1, sight1.M, r / s**2)
             _add_lens(J, problem, 1, n, by_m2, c2, sight2.M, r / s**2)
-            by_b = rotated_back(Q_middle, by_b)
-            J[DIRECTION], J[DIRECTION + 1] = dot(tangent[p, 0], by_b), dot(tangent[p, 1], by_b)
-            for i in range(3):
-                J[BEND + i] = rows * by_b[i]
+            _add_own(J, rotated_back(Q_middle, by_b), tangent[p], rows)
             _add_match(J, r, level * level * per_noise2, sums.gradient[p], sums.hessian[p])
 
 

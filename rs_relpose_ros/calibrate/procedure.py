@@ -318,18 +318,7 @@ def evaluated(
     axes_known: bool = False,
 ) -> CalibrationResult:
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
-    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
-    unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
-    if final.free[model.FOCAL]:
-        # Widened, the sigmas of the lens may exceed those of its priors.
-        known = slice(model.RADIAL, model.EXPOSURE)
-        unknowns, covariance = joined(
-            unknowns,
-            covariance,
-            known,
-            final.problem.center[known],
-            1.0 / final.problem.prior[known],
-        )
+    unknowns, covariance = _with_common_errors(final, config)
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
     rates, one_axis, _ = data.excitation(parameters[model.BIAS], R_cam_imu)
@@ -378,6 +367,18 @@ def evaluated(
         frame_interval=data.interval,
         warnings=tuple(filter(None, notes)),
     )
+
+
+def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[model.Unknowns, Array]:
+    """Unknowns and covariance of a fit with the errors that are common to the recording."""
+    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
+    unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
+    if not final.free[model.FOCAL]:
+        return unknowns, covariance
+    # Widened, the sigmas of the lens may exceed the sigmas of its priors.
+    known = slice(model.RADIAL, model.EXPOSURE)
+    center, variances = final.problem.center[known], 1.0 / final.problem.prior[known]
+    return joined(unknowns, covariance, known, center, variances)
 
 
 def _offset_of_row_0(

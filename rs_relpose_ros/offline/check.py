@@ -285,12 +285,18 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
     if unordered:
         text += f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} s)'
     unit = counter_unit(furthest_back, stamps.interval) if furthest_back > 0.0 else ''
-    return by_case(
-        name,
-        text,
-        measured,
+    smooth = jitter <= max(0.2 * stamps.interval, 1e-3)
+    out_of_order = _order_cases(stamps.count, unordered, furthest_back, unit, of)
+    return by_case(name, text, measured, *out_of_order, *_evenness_cases(smooth, varying, of))
+
+
+def _order_cases(
+    count: int, unordered: int, furthest_back: float, unit: str, of: str
+) -> tuple[Case, ...]:
+    """Cases of stamps that are repeated or go back in time."""
+    return (
         Case(
-            unordered > _UNORDERED_SHARE * stamps.count,
+            unordered > _UNORDERED_SHARE * count,
             WRONG,
             f'have the driver of {of} stamp each message with its own time',
         ),
@@ -311,7 +317,13 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
             SUSPECT,
             'these messages are not used: look for two publishers on the topic',
         ),
-        Case(jitter <= max(0.2 * stamps.interval, 1e-3), OK),
+    )
+
+
+def _evenness_cases(smooth: bool, varying: Varying, of: str) -> tuple[Case, ...]:
+    """Cases of stamps in order, by how evenly they follow each other."""
+    return (
+        Case(smooth, OK),
         Case(
             varying is Varying.EXPOSURE,
             OK,
