@@ -431,17 +431,17 @@ def test_samples_of_another_frame_are_refused_until_reset(own_node, monkeypatch)
     monkeypatch.setattr(own_node, '_warn', warnings.append)
     first, other, again = map(imu_message, walk('walk:2', 1.0).samples[:3])
     other.header.frame_id = 'gimbal_imu'
-    own_node._on_sample(Role.IMU, build.serialized(first))
-    own_node._on_sample(Role.IMU, build.serialized(other))
+    own_node._on_sample(Role.IMU, first)
+    own_node._on_sample(Role.IMU, other)
     assert own_node._estimator.newest_ns == stamp_of(first)
     [warning] = warnings
     assert warning.startswith('a message of gimbal_imu on /imu is not used')
     assert 'remap imu to one IMU' in warning
-    own_node._on_sample(Role.IMU, build.serialized(again))
+    own_node._on_sample(Role.IMU, again)
     assert own_node._estimator.newest_ns == stamp_of(again)
     own_node._reset(Trigger.Request(), Trigger.Response())
     other.header.stamp = imu_message(walk('walk:2', 1.0).samples[3]).header.stamp
-    own_node._on_sample(Role.IMU, build.serialized(other))
+    own_node._on_sample(Role.IMU, other)
     assert own_node._estimator.newest_ns == stamp_of(other)
 
 
