@@ -514,8 +514,8 @@ class OdometryEstimator:
         """Add a keyframe at the pair's current image, and the pair if it agrees with the path."""
         at_ns = pair.current_imu_ns
         # Pairs that deviate together are wrong together: their covariance is too small by that.
-        # Without this factor an object that moves through the images pulls the path.
-        # [measured: docs/lab/odometry.md, "Disturbances", object: 11 % of positions were beyond]
+        # [measured: docs/lab/odometry.md, "Deviations": walks do not need this factor; it is kept
+        # for recordings, on which it was not left out]
         recent = [one for when, one, _ in run.recent if when > at_ns - _RECENT_NS]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
         # The gyro predicts a rotation before the scale is known.
