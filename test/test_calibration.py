@@ -798,7 +798,8 @@ def test_the_interval_between_frames_bounds_the_readout(sign):
     middle = final.unknowns.parameters[OFFSET] - 0.5 * moved
     first = 0.5 * (recorded().truth.height - 1) / recorded().truth.height
     assert result.time_offset.value == pytest.approx(middle - first * mean, abs=1e-5)
-    turn = Rotation.from_matrix(result.R_cam_imu.T @ final.unknowns.R_imu_cam.T).as_rotvec()
+    # The deviation of the axes is a rotation on the left of R_cam_imu.
+    turn = Rotation.from_matrix(result.R_cam_imu @ final.unknowns.R_imu_cam).as_rotvec()
     np.testing.assert_allclose(turn, [0.1 * moved, 0.0, 0.0], atol=1e-6)
     assert any(f'{1e3 * interval:.1f} ms between frames' in text for text in result.warnings)
     text = parameter_file(result, 'A test.', camera=camera_of(recorded().truth), compressed=False)

@@ -210,9 +210,15 @@ def sensor_messages(
         if role is not Role.TRUTH
     }
     for message in bag.messages([topic for _, topic in found.values()], by_stamp=True):
-        if message.topic in streams:
-            streams[message.topic].add(message.message)
-        yield found[message.topic][0], message
+        role, content = found[message.topic][0], message.message
+        if role is not Role.TRUTH and (role is not Role.IMU or has_gyro(content)):
+            streams[message.topic].add(content.header)
+        yield role, message
+
+
+def has_gyro(message: Any) -> bool:
+    """Whether an IMU message has an angular velocity (REP-145: -1 in its covariance: none)."""
+    return bool(message.angular_velocity_covariance[0] != -1.0)
 
 
 # -- Stuck and saturated sensors ------------------------------------------------------------------
@@ -344,7 +350,8 @@ class Intake:
         if role is Role.CAMERA_INFO and self._configured is not None:
             return None
         try:
-            self._stream(role).add(message)
+            if role is not Role.IMU or has_gyro(message):
+                self._stream(role).add(message.header)
             data = PARTS[role].read(message)
             if role is Role.IMAGE:
                 if Role.IMU in self._streams and self._streams[Role.IMU].fault:

@@ -33,6 +33,9 @@ _WITHIN_BURST = 0.25
 # Share of such steps that makes bursts: (n - 1) / n of bursts of n samples. [chosen: 0.7 are
 # bursts of 3.4 samples; pairs of gyro and accelerometer on one topic make 0.5]
 _IN_BURSTS = 0.7
+# Smallest size of bursts. Smaller ones are a rate that has changed, or messages that overtake each
+# other. [derived: bursts of 3 samples have two short steps of three, near the share above]
+_SMALLEST_BURST = 3
 # Fewer steps are no evidence. [chosen: any value from 20 to 100 would do]
 _FEWEST_STEPS = 40
 # Longer steps are gaps and steps of a clock, not the time between bursts [ns]. [chosen: any value
@@ -119,6 +122,8 @@ def find_bursts(stamps: Stamps) -> Bursts | None:
     if within.mean() < _IN_BURSTS or len(starts) < 3:
         return None
     size = float(np.median(np.diff(starts)))
+    if size < _SMALLEST_BURST:
+        return None
     ends_ns = np.cumsum(steps)[starts]
     return Bursts(round(size), size * NANOSECONDS / float(np.median(np.diff(ends_ns))))
 
@@ -239,11 +244,12 @@ class Stream:
         self._returns = self._count = self._impossible = 0
         self._stamps: deque[int] = deque(maxlen=_WINDOW)
 
-    def add(self, message: Any) -> None:
-        """Add the next message; InputError if the stream has two publishers or no stamps."""
-        header = message.header
-        if self._has_gyro and message.angular_velocity_covariance[0] == -1.0:
-            return  # of the accelerometer of a driver that publishes both on one topic
+    def add(self, header: Any) -> None:
+        """Add the next message by its header.
+
+        InputError if the stream has two publishers or no stamps. Messages of the accelerometer of
+        a driver that publishes both sensors on one topic are not added.
+        """
         self._count_publishers(str(header.frame_id))
         self._count_stamps(header.stamp)
         if self._has_gyro:
