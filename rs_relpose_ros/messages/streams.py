@@ -267,7 +267,7 @@ class Stream:
             self._others.append(frame_id)
         self._frame_id = frame_id
         if self._returns >= _RETURNS:
-            names = ' and '.join(repr(one) for one in self._others[:4])
+            names = ' and '.join(repr(one[:60]) for one in self._others[:4])
             raise InputError(
                 f'{self.topic} has several publishers: its messages come with the frame_id '
                 f'{names} in turn; give each driver a topic of its own (remap)'
