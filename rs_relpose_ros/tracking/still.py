@@ -40,9 +40,10 @@ _LEAST_MOTION = 0.5
 # Least change E of an informative cell [gray levels]. [derived: six times the noise of a mean of
 # 4 x 4 pixels with a noise of 2 gray levels]
 _LEAST_CHANGE = 3.0
-# Largest D of a still cell as a share of E. Cells that move as the rotation says have D / E of
-# about 1; repeated images that are compressed again have 0.02 to 0.15. [measured: walks in three
-# scenes, images with noise of 0.8 gray levels compressed again: see test_still.py]
+# Largest D of a still cell as a share of E. Cells that move as the rotation says have D / E of about
+# 1, as E is their change; a larger share takes slow motion for none, a smaller one takes the noise
+# of repeated images for motion. [chosen: separates both kinds in test_still.py; half and double of
+# it were not tried]
 _STILL = 0.25
 # Least share of the cells that have to be informative for a verdict on the whole image. A wall
 # without texture tells nothing. [chosen: a tenth to a half would do]
