@@ -40,8 +40,8 @@ _LEAST_MOTION = 0.5
 # Least change E of an informative cell [gray levels]. [derived: six times the noise of a mean of
 # 4 x 4 pixels with a noise of 2 gray levels]
 _LEAST_CHANGE = 3.0
-# Largest D of a still cell as a share of E. Cells that move as the rotation says have D / E of about
-# 1, as E is their change; a larger share takes slow motion for none, a smaller one takes the noise
+# Largest D of a still cell as a share of E. Cells that move as the rotation says have D near E,
+# as E is their change; a larger share takes slow motion for none, a smaller one takes the noise
 # of repeated images for motion. [chosen: separates both kinds in test_still.py; half and double of
 # it were not tried]
 _STILL = 0.25
