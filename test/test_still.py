@@ -82,6 +82,15 @@ def test_a_camera_at_rest_repeats_nothing():
     assert not any(added(parts, k, image, np.array([0.3, 0.2])).repeated for k in range(50))
 
 
+@pytest.mark.parametrize('motion', [1e7, 1e12, np.inf])
+def test_a_motion_out_of_the_image_tells_nothing(motion):
+    """A gyro in deg/s predicts motions of many widths: no verdict, and no endless reflection."""
+    parts = StillParts()
+    _, image = next(walk(1))
+    added(parts, 0, image, np.zeros(2))
+    assert not added(parts, 1, image, np.full(2, motion)).repeated
+
+
 def test_a_wall_without_texture_repeats_nothing():
     parts = StillParts()
     image = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)

@@ -135,8 +135,10 @@ def _compared(
 ) -> tuple[Flags, Flags]:
     """Which cells (ROWS, COLUMNS) are informative, and which of all cells are still."""
     height, width = before.shape
-    known = np.isfinite(motion).all(axis=2)
-    field = np.nan_to_num(motion).astype(np.float32)
+    # Content that comes from far outside the image is not known. A wrong gyro makes motions of
+    # many image widths, which `remap` would reflect at the border one width at a time.
+    known = (np.abs(motion) < width).all(axis=2)  # NaN is not known either
+    field = np.where(known[..., np.newaxis], motion, 0.0).astype(np.float32)
     dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     # The content of a pixel comes from where the motion began.
