@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.calibration.findings import Code, Finding, FindingState, Why
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.pipeline.findings import Code, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 
 Types = Callable[[str], Any]

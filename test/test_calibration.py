@@ -14,17 +14,11 @@ from scipy.stats import norm, t
 from rs_relpose_lab.experiments import calibration as benchmark
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
-from rs_relpose_ros.calibrate import coplanarity, observations
-from rs_relpose_ros.calibrate import fit as fitting
-from rs_relpose_ros.calibrate.coplanarity import (
-    EXPOSURE,
-    GLOBAL,
-    LENS,
-    OFFSET,
-    READOUT,
-    SLOPE,
-)
-from rs_relpose_ros.calibrate.fit import (
+from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, evaluated
+from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
+from rs_relpose_ros.calibration import fit as fitting
+from rs_relpose_ros.calibration import model, observations
+from rs_relpose_ros.calibration.fit import (
     evaluate,
     Fit,
     initial,
@@ -34,7 +28,15 @@ from rs_relpose_ros.calibrate.fit import (
     stepped,
     widened,
 )
-from rs_relpose_ros.calibrate.observations import (
+from rs_relpose_ros.calibration.model import (
+    EXPOSURE,
+    GLOBAL,
+    LENS,
+    OFFSET,
+    READOUT,
+    SLOPE,
+)
+from rs_relpose_ros.calibration.observations import (
     frame_times,
     GyroSeries,
     make_pairs,
@@ -44,8 +46,6 @@ from rs_relpose_ros.calibrate.observations import (
     Tracks,
     Varying,
 )
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, evaluated
-from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError
@@ -55,8 +55,8 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.
 # First places of entries with more than one value.
-BIAS, CENTER = coplanarity.BIAS.start, coplanarity.CENTER.start
-ROTATION = coplanarity.ROTATION.start
+BIAS, CENTER = model.BIAS.start, model.CENTER.start
+ROTATION = model.ROTATION.start
 MODELS = {
     'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
     'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
@@ -354,7 +354,7 @@ def test_search_finds_offset_and_rotation(rotation, axes):
 
 
 @lru_cache(maxsize=1)
-def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
+def few_pairs() -> tuple[model.Problem, model.Unknowns, Truth]:
     """Pairs, and a calibration a little off the truth."""
     rng = np.random.default_rng(1)
     recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
@@ -372,7 +372,7 @@ def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
         np.array(truth.gyro_bias),
         noise=1.0,
     )
-    unknowns.parameters[coplanarity.LENS] = 0.01, 0.02, 1.0, -2.0
+    unknowns.parameters[model.LENS] = 0.01, 0.02, 1.0, -2.0
     return problem, unknowns, truth
 
 
@@ -380,11 +380,11 @@ def test_a_step_of_the_axes_turns_the_camera_and_that_of_the_lens_is_true_minus_
     """R_true = Exp(c) R_cam_imu in the axes of the camera, and f_true = f exp(c)."""
     _, unknowns, truth = few_pairs()
     step = np.zeros(GLOBAL)
-    step[coplanarity.ROTATION] = 0.02, -0.01, 0.03
+    step[model.ROTATION] = 0.02, -0.01, 0.03
     turned = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ unknowns.R_imu_cam.T
     np.testing.assert_allclose(stepped(unknowns, step).R_imu_cam.T, turned, atol=1e-12)
     camera = camera_of(truth)
-    moved = camera.moved_lens(coplanarity.LENS_BASIS @ [0.1, 0.02, 3.0, -4.0])
+    moved = camera.moved_lens(model.LENS_BASIS @ [0.1, 0.02, 3.0, -4.0])
     assert moved.fx == pytest.approx(camera.fx * math.exp(0.1))
     assert (moved.cx - camera.cx, moved.cy - camera.cy) == pytest.approx((3.0, -4.0))
     assert moved.distortion[0] == pytest.approx(0.02)
@@ -415,7 +415,7 @@ def test_gradient_is_that_of_finite_differences():
 def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
     problem, unknowns, truth = few_pairs()
     unknowns = unknowns._replace(parameters=unknowns.parameters.copy())
-    unknowns.parameters[coplanarity.LENS] = 0.0  # the points are moved in front of it
+    unknowns.parameters[model.LENS] = 0.0  # the points are moved in front of it
     residuals = evaluate(problem, unknowns, derivatives=False).residuals
     # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
     h, n = 1e-4, 17
@@ -445,7 +445,7 @@ def test_rays_are_the_same_through_every_camera_model(model):
     tracks = few_frames(recorded.tracks, 3)
     camera = dataclasses.replace(pinhole, distortion_model=model, distortion=MODELS[model])
 
-    def problem(points: np.ndarray, camera: RollingShutterCamera) -> coplanarity.Problem:
+    def problem(points: np.ndarray, camera: RollingShutterCamera) -> model.Problem:
         estimated = dataclasses.replace(tracks, points=points)
         data = Observations.of(estimated, recorded.gyro, camera)
         pairs = make_pairs(
@@ -660,7 +660,7 @@ def test_errors_of_lens_and_gyro_are_added():
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
     # A gyro whose rates are 0.5 % larger has a bias that is 0.5 % larger, at least.
     bias = np.abs(recorded().truth.gyro_bias)
-    assert (np.sqrt(np.diag(difference)[coplanarity.BIAS]) > 0.3 * errors.gyro_scale * bias).all()
+    assert (np.sqrt(np.diag(difference)[model.BIAS]) > 0.3 * errors.gyro_scale * bias).all()
     none = widened(final, ModelErrors(*[0.0] * len(errors)))
     np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-9)
 

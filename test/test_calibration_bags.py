@@ -16,7 +16,7 @@ import yaml
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_ros.calibrate import procedure
-from rs_relpose_ros.calibrate.observations import GyroSeries, Tracks
+from rs_relpose_ros.calibration.observations import GyroSeries, Tracks
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig

@@ -16,15 +16,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibrate.result import Estimate
-from rs_relpose_ros.cli.main import main
-from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.config.settings import Parameters, sensor_model
-from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
-from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check import check_bag, quantity_findings
-from rs_relpose_ros.offline.check_recording import Stamps
-from rs_relpose_ros.pipeline.findings import (
+from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
     Evidence,
@@ -33,7 +25,15 @@ from rs_relpose_ros.pipeline.findings import (
     QUANTITIES,
     Why,
 )
-from rs_relpose_ros.pipeline.findings_text import text_of
+from rs_relpose_ros.calibration.findings_text import text_of
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.offline import check_recording
+from rs_relpose_ros.offline.check import check_bag, quantity_findings
+from rs_relpose_ros.offline.check_recording import Stamps
 from rs_relpose_ros.tracking.images import Pixels
 
 START, TYPES = 1_700_000_000_000_000_000, build.rosbags_types

@@ -21,6 +21,7 @@ from rs_relpose_lab.experiments import global_shutter as lab
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
 from rs_relpose_ros.bags.reader import open_bag, RawMessage
+from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.cli.main import main as command_line
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
@@ -31,7 +32,6 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import Intake, Role, stamp_ns
-from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.global_shutter import MiddleRow, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage

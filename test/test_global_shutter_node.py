@@ -21,11 +21,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration.findings import Assessment
+from rs_relpose_ros.calibration.findings_text import message_json
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.messages.incoming import Intake, sensor_messages
 from rs_relpose_ros.offline.replay import outcomes
-from rs_relpose_ros.pipeline.findings import Assessment
-from rs_relpose_ros.pipeline.findings_text import message_json
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
 

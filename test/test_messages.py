@@ -23,6 +23,7 @@ from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMU_FRAME, open_bag
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.calibration.findings import Assessment, Code, Finding, FindingState, Why
 from rs_relpose_ros.cli import main as command_line
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
@@ -35,7 +36,6 @@ from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import Intake, repeats, Role, StuckGyro
 from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.transforms import FrameTree, Transform, with_extrinsics
-from rs_relpose_ros.pipeline.findings import Assessment, Code, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking.images import CompressedImage, GrayLevels

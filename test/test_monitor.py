@@ -12,6 +12,26 @@ import pytest
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration import assessment, findings, posterior
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+    worst_of,
+)
+from rs_relpose_ros.calibration.findings_text import (
+    line,
+    message_json,
+    one_line,
+    read_message_json,
+    summary_json,
+    text_of,
+)
+from rs_relpose_ros.calibration.posterior import pair_information, PairData, Posterior
+from rs_relpose_ros.calibration.rotations import AccelerationSums, rotation_of_rays, RotationSums
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
 from rs_relpose_ros.core.deviations import LENS, LIVE, N_DEVIATIONS, PARTS
@@ -32,29 +52,9 @@ from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.offline.replay import read_truth, Replay
-from rs_relpose_ros.pipeline import assessment, findings, recursion
-from rs_relpose_ros.pipeline.findings import (
-    Assessment,
-    Code,
-    Evidence,
-    Finding,
-    FindingState,
-    Why,
-    worst_of,
-)
-from rs_relpose_ros.pipeline.findings_text import (
-    line,
-    message_json,
-    one_line,
-    read_message_json,
-    summary_json,
-    text_of,
-)
 from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonitor, Tracked
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
-from rs_relpose_ros.pipeline.recursion import pair_information, PairData, Recursion
-from rs_relpose_ros.pipeline.rotations import AccelerationSums, rotation_of_rays, RotationSums
 
 AXES, BIAS = LIVE.part('axes'), LIVE.part('gyro_bias')
 OFFSET, READOUT = LIVE.index('time_offset'), LIVE.index('readout_time')
@@ -174,7 +174,7 @@ def solved(pairs, active, about):
 
 def test_pairs_are_exact_at_times_that_are_far_off():
     """Linearised about the truth, they are solved to it, once the gyro after them is known."""
-    c, linear, exact = deviation(time_offset=0.03), *(recursion.Recursion() for _ in range(2))
+    c, linear, exact = deviation(time_offset=0.03), *(posterior.Posterior() for _ in range(2))
     for k in range(9):
         for found in linear, exact:
             found.add(k, pair_data(0.3 * k, 0.3 * (k + 1), c), NONE, c)
@@ -212,8 +212,8 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences(image):
 
     def frames(camera=pair.camera, at=basis[0] * 0.0):
         moved = replace(pair, camera=camera)
-        problem = recursion.problem_of(moved)
-        return [recursion.frame_rows(moved, problem, k, at * (k == image)) for k in (0, 1)]
+        problem = posterior.problem_of(moved)
+        return [posterior.frame_rows(moved, problem, k, at * (k == image)) for k in (0, 1)]
 
     def residuals(rows):
         vectors = [one.views.reshape(-1, 9) for one in rows]
@@ -223,7 +223,7 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences(image):
     still = here[1 - image]
     unmoved = RowStates(*(0.0 * values for values in still.states))
     here[1 - image] = still._replace(states=unmoved)
-    value, analytic = recursion.residuals_by_deviation(state, here)
+    value, analytic = posterior.residuals_by_deviation(state, here)
     np.testing.assert_allclose(value, residuals(here), atol=1e-12)
     for k in range(N_DEVIATIONS):
         step = 1e-4 if k in range(N_DEVIATIONS)[PARTS['principal_point']] else 1e-6  # px, others
@@ -396,7 +396,7 @@ def test_derivative_by_the_rates_by_finite_differences():
 
 
 def recursion_of(pairs, stamps_ns):
-    sums = Recursion()
+    sums = Posterior()
     for stamp_ns, pair in zip(stamps_ns, pairs, strict=True):
         assert sums.add(stamp_ns, pair, NONE, NONE) is not None
     return sums
@@ -409,8 +409,8 @@ def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
     for stamp_ns, left in ((22_500 * MS, 3), (10_000 * MS, 1)):
         sums.add(stamp_ns, pair, NONE, NONE)
         assert len(sums.solved().b) == left
-    assert Recursion().solved() is recursion.NOTHING_ESTIMATED
-    np.testing.assert_array_equal(recursion.NOTHING_ESTIMATED.sigma, LIVE.sigmas)
+    assert Posterior().solved() is posterior.NOTHING_ESTIMATED
+    np.testing.assert_array_equal(posterior.NOTHING_ESTIMATED.sigma, LIVE.sigmas)
 
 
 # -- rotations of images and gyro ----------------------------------------------------------------
@@ -433,7 +433,7 @@ def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0)
 def faults_of(sums):
     """Gross errors by rotations alone."""
     gross = assessment.gross_errors(sums.compared(), 0.0, CONFIGURED)
-    health = assessment.assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED)
+    health = assessment.assess(posterior.NOTHING_ESTIMATED, [], gross, CONFIGURED)
     return received(health).faults
 
 
@@ -621,7 +621,7 @@ def calibration(c, sigma, coupled=0.0):
     S = correlation / np.outer(sigma, sigma)
     covariance = np.linalg.inv(S + np.diag(LIVE.sigmas**-2.0))
     pairs = np.tile(S / 20, (20, 1, 1))
-    return recursion.Calibration(
+    return posterior.Calibration(
         np.asarray(c), covariance, pairs, pairs @ c, np.ones(20), np.asarray(c), 1.0, 1.0, 1.0
     )
 
@@ -661,7 +661,7 @@ def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
     assert not assessment.find_inconsistencies(
         calibration(c, SIGMA), [EFFECT], replace(CONFIGURED, active=c)
     )
-    assert not assessment.find_inconsistencies(recursion.NOTHING_ESTIMATED, [], CONFIGURED)
+    assert not assessment.find_inconsistencies(posterior.NOTHING_ESTIMATED, [], CONFIGURED)
 
 
 @pytest.mark.parametrize(
@@ -720,7 +720,7 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
     assert small[OFFSET] == pytest.approx(5e-4) and small[BIAS].tolist() == [0.003] * 3
     doubt = np.sqrt(
         np.diag(
-            assessment.undetermined(recursion.NOTHING_ESTIMATED, replace(CONFIGURED, sigmas=small))
+            assessment.undetermined(posterior.NOTHING_ESTIMATED, replace(CONFIGURED, sigmas=small))
         )
     )
     given = [0, 1, 2, OFFSET, READOUT, FOCAL, 10]
@@ -1375,7 +1375,7 @@ def test_a_pair_without_rank_costs_no_pose(bundled_bag, monkeypatch):
     def without_rank(*_: object) -> None:
         raise np.linalg.LinAlgError('Singular matrix')
 
-    monkeypatch.setattr('rs_relpose_ros.pipeline.recursion.pair_information', without_rank)
+    monkeypatch.setattr('rs_relpose_ros.calibration.posterior.pair_information', without_rank)
     results, _ = replayed(bundled_bag, pairs=8)
     assert all(result.pose for result in results)
     assert results[-1].health.state is FindingState.UNKNOWN

@@ -22,14 +22,7 @@ from rclpy.task import Task
 from std_msgs.msg import String
 
 from rs_relpose_lab.live.processes import wait_until
-from rs_relpose_ros.config.settings import Declared, Parameters
-from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
-from rs_relpose_ros.geometry.matches import Matches
-from rs_relpose_ros.nodes import diagnostics, executor
-from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Reason, Silence, Statistics, WARN
-from rs_relpose_ros.nodes.executor import KeptWaitSet
-from rs_relpose_ros.nodes.parameters import NodeParameters
-from rs_relpose_ros.pipeline.findings import (
+from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
     Evidence,
@@ -37,7 +30,14 @@ from rs_relpose_ros.pipeline.findings import (
     FindingState,
     Why,
 )
-from rs_relpose_ros.pipeline.findings_text import line, message_json, text_of
+from rs_relpose_ros.calibration.findings_text import line, message_json, text_of
+from rs_relpose_ros.config.settings import Declared, Parameters
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+from rs_relpose_ros.geometry.matches import Matches
+from rs_relpose_ros.nodes import diagnostics, executor
+from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Reason, Silence, Statistics, WARN
+from rs_relpose_ros.nodes.executor import KeptWaitSet
+from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts

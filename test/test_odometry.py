@@ -17,6 +17,14 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.experiments.odometry import on_euroc
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.simulation import ImuModel
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+)
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
@@ -46,7 +54,6 @@ from rs_relpose_ros.odometry.pair import (
 )
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Notice, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.pipeline.findings import Assessment, Code, Evidence, Finding, FindingState, Why
 
 START_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000

@@ -46,6 +46,14 @@ from rs_relpose_lab.live import processes
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+)
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Landmarks, RelativePose, Status
@@ -61,7 +69,6 @@ from rs_relpose_ros.odometry.pair import contradiction
 from rs_relpose_ros.odometry.states import Base
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.pipeline.findings import Assessment, Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # The node may have to compile the kernels.

@@ -188,13 +188,15 @@ MAY_IMPORT = {
     'imu': BASE,
     'tracking': BASE,
     'estimator': BASE | {'solvers'},
-    'pipeline': CORE,
-    'messages': CORE | {'pipeline'},
+    'calibration': BASE | {'estimator', 'imu'},
+    'pipeline': CORE | {'calibration'},
+    'messages': CORE | {'calibration', 'pipeline'},
     'bags': BASE | {'imu', 'tracking', 'messages'},
-    'nodes': BASE | {'tracking', 'pipeline', 'messages', 'calibrate', 'odometry'},
-    'calibrate': CORE | {'pipeline', 'messages', 'bags'},
-    'offline': CORE | {'pipeline', 'messages', 'bags', 'calibrate'},
-    'odometry': BASE | {'estimator', 'imu', 'tracking', 'pipeline', 'messages', 'bags', 'offline'},
+    'nodes': BASE | {'tracking', 'calibration', 'pipeline', 'messages', 'calibrate', 'odometry'},
+    'calibrate': CORE | {'calibration', 'pipeline', 'messages', 'bags'},
+    'offline': CORE | {'calibration', 'pipeline', 'messages', 'bags', 'calibrate'},
+    'odometry': BASE
+    | {'estimator', 'imu', 'tracking', 'calibration', 'pipeline', 'messages', 'bags', 'offline'},
     'cli': BASE | {'messages', 'bags', 'offline', 'calibrate', 'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
@@ -213,6 +215,7 @@ FREE_OF_ROS = (
     'estimator',
     'imu',
     'tracking',
+    'calibration',
     'pipeline',
     'messages',
 )

@@ -9,11 +9,8 @@ from rs_relpose_lab.field.recording import base_recording, write_recording
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.scene import make_texture
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.config.settings import TrackingConfig
-from rs_relpose_ros.offline.replay import replay_into
-from rs_relpose_ros.pipeline import findings_text
-from rs_relpose_ros.pipeline.findings import (
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
     Finding,
@@ -21,6 +18,9 @@ from rs_relpose_ros.pipeline.findings import (
     Why,
     worst_of,
 )
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import TrackingConfig
+from rs_relpose_ros.offline.replay import replay_into
 from rs_relpose_ros.tracking import still
 from rs_relpose_ros.tracking.features import find_corners, make_tracker, within
 from rs_relpose_ros.tracking.still import COLUMNS, ROWS, StillParts

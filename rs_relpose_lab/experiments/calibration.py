@@ -12,9 +12,9 @@ from scipy.stats import chi2
 
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.calibrate.observations import Tracks
 from rs_relpose_ros.calibrate.procedure import CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate
+from rs_relpose_ros.calibration.observations import Tracks
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
 from rs_relpose_ros.errors import InputError
 

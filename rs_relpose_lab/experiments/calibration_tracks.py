@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.trajectory import FinePath, Trajectory
-from rs_relpose_ros.calibrate.observations import axis_maps, GyroSeries, Tracks
+from rs_relpose_ros.calibration.observations import axis_maps, GyroSeries, Tracks
 from rs_relpose_ros.geometry import Array
 
 START_NS = 1_700_000_000_000_000_000

@@ -18,8 +18,8 @@ from rs_relpose_lab.simulation.bag import made_once, right_parameters, write_bag
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.live import LiveCalibration
-from rs_relpose_ros.calibrate.observations import axis_maps
 from rs_relpose_ros.calibrate.stored import Calibrated
+from rs_relpose_ros.calibration.observations import axis_maps
 from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.config.files import read_parameters, SourcedValue, write_parameters
 from rs_relpose_ros.config.settings import Parameters

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration.findings import Finding
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
 from rs_relpose_ros.offline.replay import Replay
-from rs_relpose_ros.pipeline.findings import Finding
 
 # An error is large if it is as many sigmas of the correctly configured run.
 LARGE = 6.0

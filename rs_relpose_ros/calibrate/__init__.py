@@ -1,1 +1,1 @@
-"""Readout time, clock offset, axes, gyro bias and focal length from tracks and a gyro."""
+"""Calibration of a recording: reading, steps, results and their files."""

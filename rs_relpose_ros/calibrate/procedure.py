@@ -15,10 +15,12 @@ from scipy import special  # scipy.stats takes seconds to import, at the start o
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.calibrate import coplanarity as model
-from rs_relpose_ros.calibrate import fit, observations
-from rs_relpose_ros.calibrate.observations import GyroSeries, Observations, PairSelection, Tracks
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
+from rs_relpose_ros.calibration import fit, model, observations
+from rs_relpose_ros.calibration.findings import Code
+from rs_relpose_ros.calibration.findings_text import with_sigma
+from rs_relpose_ros.calibration.observations import GyroSeries, Observations, PairSelection, Tracks
+from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
@@ -28,9 +30,6 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
-from rs_relpose_ros.pipeline.findings import Code
-from rs_relpose_ros.pipeline.findings_text import with_sigma
-from rs_relpose_ros.pipeline.rotations import LEAST_RAYS
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
@@ -62,7 +61,7 @@ def calibrate(
 ) -> CalibrationResult:
     """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
 
-    See `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md. The clock of `gyro` differs
+    See `rs_relpose_ros.calibration.model` and docs/calibration.md. The clock of `gyro` differs
     from the camera's by at most ``config.max_time_offset``; the readout time of `camera` is not
     used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
     `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibrate.observations import AXES, axes_text
+from rs_relpose_ros.calibration.findings import Code
+from rs_relpose_ros.calibration.findings_text import with_sigma
+from rs_relpose_ros.calibration.observations import AXES, axes_text
 from rs_relpose_ros.config.files import parameter_text, SourcedValue
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
-from rs_relpose_ros.pipeline.findings import Code
-from rs_relpose_ros.pipeline.findings_text import with_sigma
 
 
 @dataclass(frozen=True, slots=True)

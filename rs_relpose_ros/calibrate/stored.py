@@ -8,12 +8,12 @@ from pathlib import Path
 import re
 from typing import Any
 
+from rs_relpose_ros.calibration.findings import Code
+from rs_relpose_ros.calibration.findings_text import with_sigma
 from rs_relpose_ros.config.files import file_values, read_parameters
 from rs_relpose_ros.config.settings import StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.output_files import written
-from rs_relpose_ros.pipeline.findings import Code
-from rs_relpose_ros.pipeline.findings_text import with_sigma
 
 # Section of the file that identifies the camera; rclpy ignores it, as no node has this name.
 # [derived: interface of the file]

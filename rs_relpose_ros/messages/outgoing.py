@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import FindingState
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.camera_info import info_field
-from rs_relpose_ros.pipeline import findings_text
-from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
 from rs_relpose_ros.tracking.images import Pixels
 

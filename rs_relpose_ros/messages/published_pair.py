@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.core.losses import robust_scale
 from rs_relpose_ros.core.triangulate import depths_of_rays
 from rs_relpose_ros.errors import InputError
@@ -24,7 +25,6 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
-from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # Largest deviation from 1 of the length of directions, quaternions and rays. Those of our node

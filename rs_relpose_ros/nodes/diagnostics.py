@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.stored import Progress
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
 from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
-from rs_relpose_ros.pipeline import findings_text
-from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts

@@ -9,6 +9,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages import outgoing
@@ -22,8 +24,7 @@ from rs_relpose_ros.nodes.diagnostics import (
 )
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
-from rs_relpose_ros.pipeline import findings_text, global_shutter
-from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
+from rs_relpose_ros.pipeline import global_shutter
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 

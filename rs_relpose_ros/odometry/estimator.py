@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
@@ -48,8 +50,6 @@ from rs_relpose_ros.odometry.states import (
     StartReport,
     StateInterval,
 )
-from rs_relpose_ros.pipeline import findings_text
-from rs_relpose_ros.pipeline.findings import Code
 
 # Largest delay of a message. With a smaller one samples of a busy driver are lost; a larger one
 # delays each keyframe where a sample is missing. [chosen: 0.05 to 0.2 s: drivers are late by less]

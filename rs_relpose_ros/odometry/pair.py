@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.calibration.findings import Code, Finding, FindingState
 from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
@@ -24,7 +25,6 @@ from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.messages.published_pair import PublishedPair
-from rs_relpose_ros.pipeline.findings import Code, Finding, FindingState
 
 # Difference of a velocity from the mean one, in units of it, from which its information does not
 # hold: it is linearised at the estimated velocity. A smaller limit drops velocities of turns, a

@@ -12,8 +12,20 @@ import numpy as np
 
 from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.reader import Bag, Chosen, SensorTopics, Topic
-from rs_relpose_ros.calibrate import observations
-from rs_relpose_ros.calibrate.observations import axes_text, frame_times, Varying
+from rs_relpose_ros.calibration import findings_text, observations
+from rs_relpose_ros.calibration.assessment import not_evaluated
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    BY_CODE,
+    Code,
+    Evidence,
+    Finding,
+    FindingState,
+    QUANTITIES,
+    Why,
+)
+from rs_relpose_ros.calibration.findings_text import Text, text_of, with_sigma
+from rs_relpose_ros.calibration.observations import axes_text, frame_times, Varying
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import ForceFault, length_fault
@@ -29,19 +41,6 @@ from rs_relpose_ros.messages.streams import (
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
-from rs_relpose_ros.pipeline import findings_text
-from rs_relpose_ros.pipeline.assessment import not_evaluated
-from rs_relpose_ros.pipeline.findings import (
-    Assessment,
-    BY_CODE,
-    Code,
-    Evidence,
-    Finding,
-    FindingState,
-    QUANTITIES,
-    Why,
-)
-from rs_relpose_ros.pipeline.findings_text import Text, text_of, with_sigma
 
 OK = FindingState.OK
 UNKNOWN = FindingState.UNKNOWN

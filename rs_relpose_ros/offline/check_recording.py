@@ -19,6 +19,15 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.calibrate.procedure import read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult
+from rs_relpose_ros.calibration import findings
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    BY_CODE,
+    Code,
+    Finding,
+    FindingState,
+    Why,
+)
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -29,15 +38,6 @@ from rs_relpose_ros.imu.buffer import ImuBuffer
 from rs_relpose_ros.imu.filters import GyroBias
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
-from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import (
-    Assessment,
-    BY_CODE,
-    Code,
-    Finding,
-    FindingState,
-    Why,
-)
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import warm_up

@@ -19,6 +19,8 @@ import numpy as np
 from rs_relpose_ros.bags.convert.text_files import check_file, read_rows, Row
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED, worst_of
+from rs_relpose_ros.calibration.findings_text import summary_json, summary_lines
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -31,8 +33,6 @@ from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
-from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED, worst_of
-from rs_relpose_ros.pipeline.findings_text import summary_json, summary_lines
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused

@@ -15,6 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.assessment import Configured
+from rs_relpose_ros.calibration.findings import Assessment
+from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -23,12 +26,9 @@ from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import Sensor, to_nanoseconds
-from rs_relpose_ros.pipeline.assessment import Configured
-from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.monitor import ConsistencyMonitor
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, Pipeline, Processor
-from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.warm_up import made_up_frames, MADE_UP_SENSOR, warm_up_pipeline
 from rs_relpose_ros.tracking.features import make_tracker, Tracker
 from rs_relpose_ros.tracking.images import GrayLevels, Pixels

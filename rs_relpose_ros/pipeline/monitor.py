@@ -9,17 +9,17 @@ import math
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
+from rs_relpose_ros.calibration.assessment import Configured, Effect, Inconsistency
+from rs_relpose_ros.calibration.findings import Assessment, Finding
+from rs_relpose_ros.calibration.posterior import Calibration, Posterior
+from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
-from rs_relpose_ros.pipeline import assessment, findings, findings_text, recursion
-from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
-from rs_relpose_ros.pipeline.findings import Assessment, Finding
-from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
-from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
 
 # Frames by which clocks are compared, and latest pairs whose shift by a deviation is evaluated.
 _ARRIVALS, _EFFECTS = 20, 30
@@ -36,12 +36,12 @@ class ConsistencyMonitor:
 
     def __init__(self) -> None:
         self.rotations = RotationSums()
-        self._recursion = Recursion()
+        self._recursion = Posterior()
         self.acceleration = AccelerationSums()
         self.agreement = Agreement()
         self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
-        self.latest: recursion.PairInformation | None = None  # of the last pair
+        self.latest: posterior.PairInformation | None = None  # of the last pair
         self._inconsistent: list[Inconsistency] = []
         self._likely = np.zeros(LIVE.size)  # about which pairs are linearised
         self._undetermined: Array | None = None  # by the pairs before
@@ -51,8 +51,8 @@ class ConsistencyMonitor:
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
         # The last pair until it is assessed.
-        self._due: tuple[recursion.PairInformation | None, RelativePose, Configured] | None = None
-        self.health, self.calibration = findings.NOT_EVALUATED, recursion.NOTHING_ESTIMATED
+        self._due: tuple[posterior.PairInformation | None, RelativePose, Configured] | None = None
+        self.health, self.calibration = findings.NOT_EVALUATED, posterior.NOTHING_ESTIMATED
 
     def add_acceleration(self, stamp_ns: int, evidence: InertialEvidence) -> None:
         """Add the evidence of a pair about the accelerometer, before the pair itself."""
@@ -63,7 +63,7 @@ class ConsistencyMonitor:
     def add_pair(
         self,
         stamp_ns: int,
-        data: recursion.PairData | None,
+        data: posterior.PairData | None,
         pose: RelativePose,
         configured: Configured,
     ) -> RelativePose:
@@ -172,7 +172,7 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
     )
 
 
-def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effect:
+def _effect(information: posterior.PairInformation, pose: RelativePose) -> Effect:
     rows, claimed = slice(3, None), pose.covariance[3:, 3:]
     if pose:  # t is a direction: along itself it has no variance, and nothing moves it there
         rows, claimed = slice(None), pose.covariance + np.pad(np.outer(pose.t, pose.t), (0, 3))
@@ -271,7 +271,7 @@ class Tracked:
         readout = LIVE.index('readout_time')
         along = np.zeros(LIVE.size)
         along[offset] = 1.0
-        along[readout] = recursion.middle_share(configured.camera)
+        along[readout] = posterior.middle_share(configured.camera)
         of_middle = configured.sensor.time_offset + float(along @ estimated.c)
         signed = configured.camera.line_delay * configured.camera.height  # active
         now = signed - configured.active[readout] + estimated.c[readout]

@@ -15,6 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.pair_problem import PairProblem
@@ -32,7 +33,6 @@ from rs_relpose_ros.imu.integration import (
     motions_on_the_way,
 )
 from rs_relpose_ros.jit import kernel
-from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.tracking.images import EncodedImage, is_dark
 

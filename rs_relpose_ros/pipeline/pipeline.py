@@ -10,6 +10,10 @@ from typing import Any, Generic
 
 import numpy as np
 
+from rs_relpose_ros.calibration import findings
+from rs_relpose_ros.calibration.assessment import Configured, configured_sigmas
+from rs_relpose_ros.calibration.posterior import PairData
+from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
@@ -23,12 +27,9 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
-from rs_relpose_ros.pipeline import findings, pair
-from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
+from rs_relpose_ros.pipeline import pair
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
 from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result, TrackHistory
-from rs_relpose_ros.pipeline.recursion import PairData
-from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
 from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking.features import make_tracker, Tracker

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
-from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.tracking.images import Image
 from rs_relpose_ros.tracking.still import (
     cell_centres,

@@ -18,8 +18,8 @@ from scipy import special  # scipy.stats takes seconds to import, at the start o
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibrate import coplanarity as model
-from rs_relpose_ros.calibrate.coplanarity import (
+from rs_relpose_ros.calibration import model
+from rs_relpose_ros.calibration.model import (
     GLOBAL,
     LOCAL,
     Problem,

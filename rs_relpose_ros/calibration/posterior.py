@@ -571,7 +571,7 @@ class _Entry(NamedTuple):
     information: PairInformation
 
 
-class Recursion:
+class Posterior:
     """The pairs of the last seconds."""
 
     def __init__(self) -> None:

@@ -15,15 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.config.settings import Parameters, SensorConfig
-from rs_relpose_ros.core.deviations import LIVE
-from rs_relpose_ros.core.least_squares import inverse, log_determinant
-from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
-from rs_relpose_ros.geometry.timing import clocks_apart
-from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import (
+from rs_relpose_ros.calibration import findings
+from rs_relpose_ros.calibration.findings import (
     Code,
     Evidence,
     Finding,
@@ -31,8 +24,15 @@ from rs_relpose_ros.pipeline.findings import (
     Quantity,
     Why,
 )
-from rs_relpose_ros.pipeline.recursion import Calibration
-from rs_relpose_ros.pipeline.rotations import RotationComparison
+from rs_relpose_ros.calibration.posterior import Calibration
+from rs_relpose_ros.calibration.rotations import RotationComparison
+from rs_relpose_ros.config.settings import Parameters, SensorConfig
+from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.least_squares import inverse, log_determinant
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.timing import clocks_apart
 
 # Sigmas beyond which a deviation is certain. Fewer would name parameters by chance, as seven are
 # tested after each pair; more would report a wrong parameter later.

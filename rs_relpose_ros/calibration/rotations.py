@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
+from rs_relpose_ros.calibration.posterior import LastSeconds, MOST_PAIRS, WINDOW_NS
 from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
@@ -16,8 +18,6 @@ from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
-from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
-from rs_relpose_ros.pipeline.recursion import LastSeconds, MOST_PAIRS, WINDOW_NS
 
 # Number of rays below which no rotation is estimated. Fewer would follow single wrong matches.
 # [chosen: 8 to 20 would do; a rotation needs two]

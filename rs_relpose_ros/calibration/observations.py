@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibrate import coplanarity as model
+from rs_relpose_ros.calibration import model
+from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
-from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
@@ -250,7 +250,7 @@ class Observations:
 
     tracks: Tracks  # of points that the camera model can map to rays
     camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
-    lens: Array  # (4,) parameters `coplanarity.LENS`
+    lens: Array  # (4,) parameters `model.LENS`
     times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes
     exposure: Exposure  # before the fit

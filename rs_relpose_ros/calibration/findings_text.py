@@ -14,10 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import clocks_apart
-from rs_relpose_ros.imu.buffer import ForceFault
-from rs_relpose_ros.pipeline.findings import (
+from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
     Evidence,
@@ -26,6 +23,9 @@ from rs_relpose_ros.pipeline.findings import (
     rounded,
     Why,
 )
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import clocks_apart
+from rs_relpose_ros.imu.buffer import ForceFault
 
 # Longest text [characters] that is read as findings of a message: those of all causes at once
 # need a tenth of it. [chosen: 20,000 to 1,000,000 would do; it bounds the work of a reader]
