@@ -2,12 +2,16 @@
 
 from __future__ import annotations  # Matplotlib is imported where it draws
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+import json
+import math
 import os
 from pathlib import Path
 import tempfile
 from typing import Any, IO, TYPE_CHECKING
+
+import numpy as np
 
 from rs_relpose_ros.errors import InputError
 
@@ -33,6 +37,24 @@ BLUE = '#0072B2'
 ORANGE = '#E69F00'  # likewise
 GREEN = '#009E73'  # likewise
 RED = '#D55E00'  # likewise
+
+
+def json_text(data: Any, indent: int = 2) -> str:
+    """Return data as JSON with a line end; NumPy's types are allowed, NaN becomes null."""
+    return json.dumps(_plain(data), indent=indent, allow_nan=False) + '\n'
+
+
+def _plain(data: Any) -> Any:
+    """Return data of the types that JSON has."""
+    if isinstance(data, np.generic | np.ndarray):
+        data = data.tolist()
+    if isinstance(data, Mapping):
+        return {str(key): _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data
 
 
 def refuse_existing(*paths: Path) -> None:

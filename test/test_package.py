@@ -8,15 +8,18 @@ import importlib
 from importlib.metadata import distribution
 import os
 from pathlib import Path
+import platform
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import tomllib
 from types import SimpleNamespace
 
 from conftest import ROOT
+import numpy as np
 import pytest
 
 from rs_relpose_ros.cli import main as command_line
@@ -357,6 +360,7 @@ def as_replay(monkeypatch):
             HELP='stand in',
             run=work,
             add_arguments=(lambda parser: parser.add_argument('number', type=int)),
+            optional_values={},
         )
         monkeypatch.setattr(command_line, 'load_command', lambda name: command)
 
@@ -404,10 +408,42 @@ def test_error_is_one_line_and_an_exit_code(error, code, line, as_replay, capsys
     assert capsys.readouterr().err == line
 
 
-def test_programming_error_is_not_hidden(as_replay):
+def test_programming_error_is_one_line_with_the_file_of_a_report(
+    as_replay, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     as_replay(lambda args: args.no_such_argument)
-    with pytest.raises(AttributeError):
-        command_line.main(['replay', '1'])
+    assert command_line.main(['replay', '1']) == command_line.FAILED
+    error = capsys.readouterr().err
+    (report,) = tmp_path.iterdir()
+    assert error.startswith('rs_relpose: internal error (AttributeError)')
+    assert error.endswith(f' {report}\n') and error.count('\n') == 1
+    text = report.read_text()
+    assert text.startswith('rs_relpose replay 1\n')
+    for words in (f'python {platform.python_version()}', f'numpy {np.__version__}', 'Traceback'):
+        assert words in text
+    assert 'no_such_argument' in text
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'absent'))
+    assert command_line.main(['replay', '1']) == command_line.FAILED
+    assert capsys.readouterr().err.endswith(' -vv\n')
+
+
+@pytest.mark.parametrize(
+    ('words', 'lens', 'bag'),
+    [
+        (['--lens', 'my_bag'], 'plumb_bob', 'my_bag'),
+        (['my_bag', '--lens'], 'plumb_bob', 'my_bag'),
+        (['--lens', 'equidistant', 'my_bag'], 'equidistant', 'my_bag'),
+        (['--lens=equidistant', 'my_bag'], 'equidistant', 'my_bag'),
+        (['--lens', '--rows', '0', '9', 'my_bag'], 'plumb_bob', 'my_bag'),
+    ],
+)
+def test_an_optional_value_does_not_swallow_the_bag(words, lens, bag):
+    words = command_line.with_optional_values(
+        ['calibrate', *words], command_line.load_command('calibrate')
+    )
+    args = command_line.make_parser('calibrate').parse_args(words)
+    assert (args.lens, str(args.bag)) == (lens, bag)
 
 
 def test_closed_pipe_is_quiet():

@@ -67,15 +67,15 @@ def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
     return covered_twice or never_passes
 
 
-def reading_order(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:
-    """Indices (N,) of messages in the order of reading.
+def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:
+    """Times (N,) [ns] in whose order messages are read: their stamps, unless a clock was set back.
 
     `stamps` (N,) [ns] and `topics` (N,), the number of the topic of each, are in the order of the
     file. `sensors` are the numbers of the topics whose clocks decide.
     """
     by_topic = {int(topic): np.flatnonzero(topics == topic) for topic in np.unique(topics)}
     runs = {topic: clock_runs(stamps[rows]) for topic, rows in by_topic.items()}
-    keys = stamps.copy()
+    times = stamps.copy()
     last = {int(runs[topic][-1]) for topic in sensors if topic in runs}
     if len(last) == 1:
         # All clocks were set back equally often, mostly never: one run is read after the other.
@@ -84,13 +84,13 @@ def reading_order(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[in
             whole[rows] = runs[topic]
         of_sensors = np.isin(topics, list(sensors))
         for run in range(1, last.pop() + 1):
-            earlier = keys[of_sensors & (whole == run - 1)].max()
+            earlier = times[of_sensors & (whole == run - 1)].max()
             here = whole == run
-            shift = earlier + _BETWEEN_RUNS_NS - keys[of_sensors & here].min()
-            keys[here] += shift
+            shift = earlier + _BETWEEN_RUNS_NS - times[of_sensors & here].min()
+            times[here] += shift
     else:
         # A sensor alone was set back: its messages keep the order of the file.
         for topic, rows in by_topic.items():
             if runs[topic][-1]:
-                keys[rows] = np.maximum.accumulate(keys[rows])
-    return np.argsort(keys, kind='stable')
+                times[rows] = np.maximum.accumulate(times[rows])
+    return times

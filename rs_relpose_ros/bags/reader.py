@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags import storage
 from rs_relpose_ros.bags.files import damage, open_files, OpenFiles
-from rs_relpose_ros.bags.order import reading_order
+from rs_relpose_ros.bags.order import reading_times
 from rs_relpose_ros.bags.storage import message_data, StoredTopic
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -214,20 +214,25 @@ def _option(role: str) -> str:
 
 
 class BagMessage(NamedTuple):
-    """A message with its topic and the time at which it was recorded [ns]."""
+    """A message with its topic and two times [ns]: of its recording, and of its reading.
+
+    Messages are read in the order of the latter.
+    """
 
     topic: str
     bag_time_ns: int
     message: Any
+    read_ns: int = 0
 
 
 class RawMessage(NamedTuple):
-    """A message as CDR bytes, with its topic and the time at which it was recorded [ns]."""
+    """A message as CDR bytes, with its topic and the times of a `BagMessage` [ns]."""
 
     topic: str
     msgtype: str
     bag_time_ns: int
     data: bytes
+    read_ns: int = 0
 
 
 @functools.cache
@@ -343,7 +348,7 @@ class Bag:
     def messages(self, topics: Sequence[Topic], *, by_stamp: bool = False) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of `raw_messages`, with arrays that are read-only."""
         for raw in self.raw_messages(topics, by_stamp=by_stamp):
-            yield BagMessage(raw.topic, raw.bag_time_ns, self.read(raw))
+            yield BagMessage(raw.topic, raw.bag_time_ns, self.read(raw), raw.read_ns)
 
     def raw_messages(
         self, topics: Sequence[Topic], *, by_stamp: bool = False
@@ -351,20 +356,20 @@ class Bag:
         """Messages of `topics` in CDR as publishers of ROS 2 expect them.
 
         They come in the order in which they were received, or `by_stamp` in the order of
-        `reading_order`, the first CameraInfo before all others.
+        `reading_times`, the first CameraInfo before all others.
         """
         index = self._index(topics)
-        order = np.argsort(index.received, kind='stable')
-        if by_stamp:
-            order = self._by_stamp(index)
+        times = self._by_stamp(index) if by_stamp else index.received
         stored = list(self._stored.values())
-        columns = (index.topic, index.file, index.place, index.offset, index.received)
-        for row in order:
-            number, file, place, offset, received = (int(column[row]) for column in columns)
+        columns = (index.topic, index.file, index.place, index.offset, index.received, times)
+        # Equal times are read in the order of the topics' names, whatever the file has first.
+        by_name = np.argsort(np.argsort([topic.name for topic in stored]))
+        for row in np.lexsort((by_name[index.topic], times)):
+            number, file, place, offset, received, read_ns = (int(one[row]) for one in columns)
             topic = stored[number]
             data = self._as_cdr(topic, self._data(file, place, offset))
             self.on_message(topic.name)
-            yield RawMessage(topic.name, topic.msgtype, received, data)
+            yield RawMessage(topic.name, topic.msgtype, received, data, read_ns)
 
     def timeline(self, topic: Topic) -> Timeline:
         """Stamps and times of reception of a topic."""
@@ -404,19 +409,19 @@ class Bag:
         return _Index(*(np.frombuffer(column, np.int64) for column in columns))
 
     def _by_stamp(self, index: _Index) -> NDArray[np.int64]:
-        """Order of reading, with a CameraInfo at the beginning where there is one."""
+        """Times of reading [ns], with a CameraInfo at the beginning where there is one."""
         of_type = {
             msgtype: [n for (_, kind), n in self._numbers.items() if kind == msgtype]
             for msgtype in (*_MEASURED, CAMERA_INFO)
         }
         sensors = [number for msgtype in _MEASURED for number in of_type[msgtype]]
-        order = reading_order(index.stamp, index.topic, sensors)
-        infos = np.flatnonzero(np.isin(index.topic[order], of_type[CAMERA_INFO]))
+        times = reading_times(index.stamp, index.topic, sensors)
+        infos = np.flatnonzero(np.isin(index.topic, of_type[CAMERA_INFO]))
         if len(infos):
             # It serves the images before it, too: drivers publish it late, or once.
-            first = infos[0]
-            order = np.concatenate((order[first : first + 1], np.delete(order, first)))
-        return order
+            earliest = infos[np.argmin(times[infos])]
+            times[earliest] = times.min() - 1
+        return times
 
     # -- data --------------------------------------------------------------------------------
 

@@ -6,7 +6,12 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 import logging
 import os
+import platform
+import shlex
 import sys
+import tempfile
+import traceback
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
@@ -96,6 +101,8 @@ class Command(NamedTuple):
     HELP: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
+    # Options whose value may be left out: the values that each of them has, and the usual one.
+    optional_values: Mapping[str, tuple[Sequence[str], str]] = MappingProxyType({})
 
 
 def package_version() -> str:
@@ -111,7 +118,23 @@ def load_command(name: str) -> Command:
     command: Any = library(module, f'the command {name} needs {LABORATORY}')
     if attribute:
         command = getattr(command, attribute)
-    return Command(command.HELP, command.add_arguments, command.run)
+    optional_values = getattr(command, 'optional_values', {})
+    return Command(command.HELP, command.add_arguments, command.run, optional_values)
+
+
+def with_optional_values(arguments: Sequence[str], command: Command) -> list[str]:
+    """Return arguments in which each option with an optional value has one.
+
+    argparse would take the word after such an option for its value, even if it is a bag.
+    """
+    words: list[str] = []
+    following = [*arguments[1:], '']
+    for word, after in zip(arguments, following, strict=True):
+        words.append(word)
+        if word in command.optional_values:
+            known, usual = command.optional_values[word]
+            words += [] if after in known else [usual]
+    return words
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:
@@ -120,7 +143,8 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
         prog=PROGRAM,
         description='Relative poses of rolling-shutter images, aided by an IMU: offline tools.',
         epilog=f'"{PROGRAM} COMMAND --help" describes a command. Exit codes: 0 done, 1 the work '
-        'ran and failed, 2 bad usage or bad input.',
+        'ran and failed, 2 bad usage or bad input. An internal error (code 1) names the file of '
+        'a report.',
     )
     parser.add_argument(
         '--version',
@@ -161,7 +185,10 @@ def _run(arguments: list[str]) -> int:
     # The options before the command have no values, so the first plain word is the command.
     selected = next((word for word in arguments if not word.startswith('-')), None)
     try:
-        args = make_parser(selected).parse_args(arguments)
+        parser = make_parser(selected)
+        if selected is not None and selected in COMMANDS:
+            arguments = with_optional_values(arguments, load_command(selected))
+        args = parser.parse_args(arguments)
     except MissingInputError as error:
         return _report_error(f'error: {error}', BAD_INPUT)
     except SystemExit as end:  # argparse has printed the error or the help
@@ -184,6 +211,47 @@ def _run(arguments: list[str]) -> int:
         return _report_error(
             f'error: {error}', FAILED if isinstance(error, OSError) else BAD_INPUT
         )
+    except Exception as error:
+        _logger.debug('raised here', exc_info=True)
+        report = _write_report(arguments, error)
+        return _report_error(
+            f'internal error ({type(error).__name__}), which is a fault of this program: please '
+            f'report it with the file {report}',
+            FAILED,
+        )
+
+
+# Packages whose versions a report of an internal error has.
+_REPORTED = (
+    'rs_relpose_ros',
+    'numpy',
+    'scipy',
+    'numba',
+    'opencv-python-headless',
+    'rosbags',
+    'av',
+)
+
+
+def _write_report(arguments: Sequence[str], error: Exception) -> str:
+    """Write what a developer needs to know of an internal error into a file; its path.
+
+    It has the arguments, versions and the traceback, and nothing of the user's recordings.
+    """
+    lines = [f'{PROGRAM} {shlex.join(arguments)}', '', f'python {platform.python_version()}']
+    lines.append(f'system {platform.platform()}')
+    for name in _REPORTED:
+        with suppress(PackageNotFoundError):
+            lines.append(f'{name} {version(name)}')
+    lines += ['', *traceback.format_exception(error)]
+    try:
+        with tempfile.NamedTemporaryFile(
+            'w', prefix=f'{PROGRAM}_error_', suffix='.txt', delete=False, encoding='utf-8'
+        ) as file:
+            file.write('\n'.join(lines))
+    except OSError:
+        return 'that cannot be written: run the command again with -vv'
+    return file.name
 
 
 def _add_verbose(parser: argparse.ArgumentParser, default: Any) -> None:

@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
-import json
 import logging
 from pathlib import Path
 import platform
@@ -23,7 +22,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline.replay import need_sensor_parameters
-from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE, written
+from rs_relpose_ros.output_files import json_text, refuse_unwritable, SUMMARY_FILE, written
 
 _logger = logging.getLogger(__name__)
 
@@ -139,8 +138,8 @@ def run_on_bag(
             'numba': numba.__version__,
         },
     }
-    with written(folder / SUMMARY_FILE) as file:  # JSON has no NaN
-        file.write(json.dumps(summary, indent=2, allow_nan=False) + '\n')
+    with written(folder / SUMMARY_FILE) as file:
+        file.write(json_text(summary))
     return folder, results
 
 

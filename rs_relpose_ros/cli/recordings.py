@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-import json
 import logging
 from pathlib import Path
 import shutil
@@ -32,7 +31,13 @@ from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.messages.transforms import bag_frames, BagFrames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport
 from rs_relpose_ros.offline.unroll import unroll
-from rs_relpose_ros.output_files import prepare_folder, refuse_existing, refuse_unwritable, written
+from rs_relpose_ros.output_files import (
+    json_text,
+    prepare_folder,
+    refuse_existing,
+    refuse_unwritable,
+    written,
+)
 
 # File of the calibrated parameters, in the folder of the results. [derived: interface]
 CALIBRATION_FILE = 'calibration.yaml'
@@ -80,7 +85,7 @@ def calibrate_bag(
     )
     mapping = calibration.as_mapping(result, recording.camera)
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
-    for path, content in ((parameters, text), (metrics, json.dumps(mapping, indent=1) + '\n')):
+    for path, content in ((parameters, text), (metrics, json_text(mapping, indent=1))):
         with written(path) as file:
             file.write(content)
     calibration.draw_curve(result, curve)
@@ -130,6 +135,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     return 0 if result.complete else FAILED
 
 
+# Distortion model that --lens estimates if none is named. [derived: interface]
+_USUAL_LENS = 'plumb_bob'
+
 # `rs_relpose calibrate`.
 CALIBRATE = Command(
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
@@ -168,7 +176,7 @@ CALIBRATE = Command(
                 'metavar': 'MODEL',
                 'choices': tuple(DISTORTION_MODELS),
                 'nargs': '?',
-                'const': 'plumb_bob',
+                'const': _USUAL_LENS,
                 'help': 'estimate focal length, first coefficient of the '
                 'distortion of this model (default: plumb_bob) and principal point, also if the '
                 'CameraInfo has a camera matrix without distortion',
@@ -192,6 +200,7 @@ CALIBRATE = Command(
         }
     ),
     _calibrate,
+    {'--lens': (tuple(DISTORTION_MODELS), _USUAL_LENS)},
 )
 
 
@@ -211,7 +220,7 @@ def inspect_bag(args: argparse.Namespace) -> CheckReport:
 def _check(args: argparse.Namespace) -> int:
     report = inspect_bag(args)
     if args.json:
-        print(json.dumps(report.to_mapping(), indent=2, allow_nan=False))
+        print(json_text(report.to_mapping()), end='')
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 100
         for line in report.lines(max(width, 60)):

@@ -112,7 +112,7 @@ def odometry_into(
             observed.append(KeyframeObservations.of_pair(pair))
             given = PublishedPair.of_result(pair)
             views[given.current_imu_ns + row_ns(given)] = pair.stamp_ns, pair.parallax
-            yield replay.last_ns, given
+            yield replay.read_ns, given
 
     samples = _samples(bag, topics)
     states = PublishedStates(estimator, parameters.odometry.odometry_rate)
@@ -326,7 +326,7 @@ def follow(
 
 
 def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]]:
-    """IMU samples and stamps of the frames of a bag with their bag times, in bag order."""
+    """IMU samples and stamps of the frames of a bag with their times of reading, in this order."""
     out: list[tuple[int, ImuSample | int]] = []
     for role, message in sensor_messages(bag, topics, (Role.IMU, Role.ACCEL, Role.CAMERA_INFO)):
         with suppress(InputError):  # the replay counts and reports it
@@ -334,7 +334,7 @@ def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]
                 value: ImuSample | int = stamp_ns(message.message.header)
             else:
                 value = PARTS[role].read(message.message)
-            out.append((message.bag_time_ns, value))
+            out.append((message.read_ns, value))
     return out
 
 

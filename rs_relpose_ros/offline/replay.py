@@ -122,6 +122,7 @@ class Replay:
         # Wall times [s]: of the whole without compilation, and of tracking and estimation.
         self.seconds = self.processing_seconds = 0.0
         self.first_ns = self.last_ns = 0  # bag times of the first and of the last message so far
+        self.read_ns = 0  # time of reading of the last message
         # Unused frames and messages, by the first message of each reason.
         self.reasons = ReasonCounts()
 
@@ -174,7 +175,7 @@ class Replay:
     def _messages(self) -> Iterator[tuple[Role, BagMessage]]:
         for role, message in sensor_messages(self._bag, self._topics):
             self.first_ns = self.first_ns or message.bag_time_ns
-            self.last_ns = message.bag_time_ns
+            self.last_ns, self.read_ns = message.bag_time_ns, message.read_ns
             yield role, message
 
 
