@@ -49,7 +49,8 @@ def source_digest(module: str) -> str:
 @functools.cache
 def _folder() -> Path:
     """NUMBA_CACHE_DIR, the folder of the build or, if that is read-only, a user's links to it."""
-    built, chosen = _PACKAGE / '__pycache__' / 'kernels', os.environ.get('NUMBA_CACHE_DIR')
+    built = _PACKAGE / '__pycache__' / 'kernels'
+    chosen = os.environ.get('NUMBA_CACHE_DIR')
     users = Path(
         os.environ.get('XDG_CACHE_HOME') or '~/.cache',
         _PACKAGE.name,

@@ -744,7 +744,7 @@ def test_gradient_of_each_prior(weights):
     prior = priors_near(rng, state, **weights)
     n = priors.unknowns(prior)
     assert n == PARAMETERS + ('scale' in weights)
-    nothing = fit.DataTerm(np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0)
+    nothing = fit.NormalEquations(np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0)
     _, gradient, cost = fit.with_priors(nothing, state, prior)
     assert cost == pytest.approx(priors.prior_cost(state, prior))
     assert cost > 0.0

@@ -31,11 +31,11 @@ from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.core.rows import row_states, RowStates
 from rs_relpose_ros.estimator import priors
 from rs_relpose_ros.estimator.covariance import image_regions, IMAGES, POSE, REGIONS
-from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
+from rs_relpose_ros.estimator.fit import gauss_newton
 from rs_relpose_ros.estimator.priors import PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.estimator.sampling import translation_direction
-from rs_relpose_ros.estimator.sampson import jacobian, residuals
+from rs_relpose_ros.estimator.sampson import FitMatches, jacobian, residuals
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.gyro import GyroPath

@@ -196,7 +196,8 @@ def _orbslam(document: Mapping[str, Any]) -> Calibration:
     model = 'radtan'
     names: tuple[str, ...] = ('k1', 'k2', 'p1', 'p2', 'k3')
     if kind == 'KannalaBrandt8':
-        model, names = 'equidistant', ('k1', 'k2', 'k3', 'k4')
+        model = 'equidistant'
+        names = ('k1', 'k2', 'k3', 'k4')
     coefficients = [float(document.get(f'{camera}.{name}', 0.0)) for name in names]
     if model == 'radtan' and coefficients[4] == 0.0:
         coefficients.pop()
@@ -205,7 +206,8 @@ def _orbslam(document: Mapping[str, Any]) -> Calibration:
     transform = document.get('IMU.T_b_c1', document.get('Tbc'))
     if transform is not None:
         values |= _extrinsics(_inverse(_matrix(transform)))
-    width, height = document.get('Camera.width'), document.get('Camera.height')
+    width = document.get('Camera.width')
+    height = document.get('Camera.height')
     size = None if width is None or height is None else (int(width), int(height))
     return Calibration('settings of ORB-SLAM3', values | _noise(document), size)
 

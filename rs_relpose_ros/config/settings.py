@@ -93,7 +93,8 @@ class Settings:
         for item in dataclasses.fields(self):
             if 'declared' not in item.metadata:
                 continue
-            value, kind = getattr(self, item.name), declared(item).kind
+            value = getattr(self, item.name)
+            kind = declared(item).kind
             if value is None and item.default is None:
                 continue
             if kind is tuple and isinstance(value, list | tuple):

@@ -28,6 +28,16 @@ def first_indices(**sizes: int) -> dict[str, int]:
     return first
 
 
+def slices(**sizes: int) -> dict[str, slice]:
+    """Places of each named part of a vector.
+
+    >>> slices(position=3, angle=1)
+    {'position': slice(0, 3, None), 'angle': slice(3, 4, None)}
+    """
+    first = first_indices(**sizes)
+    return {name: slice(first[name], first[name] + size) for name, size in sizes.items()}
+
+
 # -- One matrix -----------------------------------------------------------------------------------
 
 

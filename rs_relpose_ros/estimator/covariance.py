@@ -11,16 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.core import losses
 from rs_relpose_ros.core.deviations import FIRST, Selection
 from rs_relpose_ros.core.least_squares import adjusted_scores, cholesky, CR2, eliminate, inverse
-from rs_relpose_ros.estimator import priors, sampson
-from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
+from rs_relpose_ros.estimator.fit import linearised, with_priors
 from rs_relpose_ros.estimator.priors import (
     D1,
+    D2,
     DW1,
+    DW2,
     PARAMETERS,
     Priors,
     SCALE,
@@ -28,8 +28,9 @@ from rs_relpose_ros.estimator.priors import (
     THETA,
     TwoViewState,
 )
-from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.estimator.problem import PairState, PARTS, TwoViewProblem
+from rs_relpose_ros.estimator.sampson import FitMatches
+from rs_relpose_ros.geometry import Array, Indices, so3
 from rs_relpose_ros.jit import kernel, small_kernel
 
 # Regions of the field that the matches cover: columns and rows. The errors of neighbours (blur,
@@ -62,24 +63,24 @@ def sandwich(
 ) -> Array:
     """``H^-1 S H^-1`` (n, n) at an optimum `state` with the Hessian H, `covariance` being H^-1.
 
-    `data_hessian` (n, n) is the matches' part of H. S is the sum of their covariance, of the
-    priors' part of H, and of the excess of the gyro's priors beyond their configured sigmas.
-    `gyro_error` (3, 3): covariance of errors of the gyro's rotation that are not in its prior.
+    `data_hessian` (n, n) is the part of the matches in H. S is the sum of their covariance, of the
+    part of the priors in H, and of the excess of the priors by the gyro beyond their configured
+    sigmas. `gyro_error` (3, 3) is the covariance of those errors of the rotation by the gyro that
+    are not in its prior.
     """
     ratio = gyro_variance_ratio(state, prior, covariance)
     excess = np.zeros(hessian.shape)
     information = prior.rotation_information
     rotation = (ratio - 1.0) * information + information @ gyro_error @ information
-    for i in range(3):
-        for j in range(3):
-            excess[THETA + i, THETA + j] = rotation[i, j]
+    so3.copy_matrix(rotation, excess[THETA:, THETA:])
     for i in range(DW1, PARAMETERS):
         excess[i, i] = (ratio - 1.0) * prior.rate_weight
     # If gyro and images disagree, either may be in error: the noise of both is larger. [measured:
     # 117 pairs of recordings, two views: without it NEES of t 1.9 for 1.7 and 5.1 % beyond 3 sigma
     # for 3.4 %; without the ratio at all, NEES of R 1.7 for 1.35]
     of_matches = max(ratio, 1.0) * score_of_matches(matches, state, data_hessian, hessian)
-    return covariance @ (of_matches + (hessian - data_hessian) + excess) @ covariance
+    scores = of_matches + (hessian - data_hessian) + excess
+    return covariance @ scores @ covariance
 
 
 @small_kernel
@@ -89,7 +90,9 @@ def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
     T is lower triangular. C is returned unchanged if one of the two others is singular.
     """
     n = len(covariance)
-    L_before, L_after, T = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    L_before = np.zeros((n, n))
+    L_after = np.zeros((n, n))
+    T = np.zeros((n, n))
     if not (cholesky(before, L_before) and cholesky(after, L_after)):
         return covariance
     for i in range(n):
@@ -110,45 +113,50 @@ def score_of_matches(
     The errors of matches in one region of the image may be correlated.
     """
     regions = image_regions(matches)
-    weight = 1.0 / (matches.sigma * matches.sigma)
-    count, n = REGIONS[0] * REGIONS[1], len(hessian)
-    scores, curvatures = np.zeros((count, n)), np.zeros((count, n, n))
-    filled, cost = 0, 0.0
-    for g in range(count):
-        use = regions == g
-        if not use.any():
+    count = REGIONS[0] * REGIONS[1]
+    n = len(hessian)
+    scores = np.zeros((count, n))
+    curvatures = np.zeros((count, n, n))
+    filled = 0
+    cost = 0.0
+    for region in range(count):
+        weights = (regions == region) * matches.weights
+        if not weights.any():
             continue
-        own, gradient, squares = sampson.normal_equations(
-            matches.observations, use * matches.weights, state
-        )
-        so3.copy_vector(weight * gradient, scores[g])
-        so3.copy_matrix(weight * own, curvatures[g])
+        used = FitMatches(matches.observations, weights, matches.sigma, matches.focal)
+        own = linearised(used, state)
+        so3.copy_vector(own.gradient, scores[region])
+        so3.copy_matrix(own.hessian, curvatures[region])
         filled += 1
-        cost += weight * squares
+        cost += own.cost
     adjusted = adjusted_scores(scores, curvatures, hessian, CR2)
     # Noise by the residuals alone, without the configured sigma: (units of sigma)^2.
-    variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - losses.FITTED, 0.0))
+    freedom = max(matches.weights.sum() - losses.FITTED, 0.0)
+    variance = (1.0 + cost) / (1.0 + freedom)
     share = filled / (filled + HESSIAN_REGIONS)
     return share * adjusted.T @ adjusted + (1.0 - share) * variance * data_hessian
 
 
 @kernel
-def image_regions(matches: FitMatches) -> NDArray[np.int64]:
+def image_regions(matches: FitMatches) -> Indices:
     """Region number of each match (N,), by its first ray; -1 for those that are not used."""
-    n = len(matches.weights)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    rays = matches.observations
+    n = len(rays)
+    low = np.full(2, np.inf)
+    high = np.full(2, -np.inf)
     for i in range(n):
         if matches.weights[i] > 0.0:
             for k in range(2):
-                low[k] = min(low[k], matches.observations[i, k])
-                high[k] = max(high[k], matches.observations[i, k])
+                low[k] = min(low[k], rays[i, k])
+                high[k] = max(high[k], rays[i, k])
     regions = np.full(n, -1)
     for i in range(n):
         if matches.weights[i] > 0.0:
             number = 0
             for k in range(2):
-                share = (matches.observations[i, k] - low[k]) / max(high[k] - low[k], 1e-12)
-                number = REGIONS[k] * number + min(int(REGIONS[k] * share), REGIONS[k] - 1)
+                share = (rays[i, k] - low[k]) / max(high[k] - low[k], 1e-12)
+                place = min(int(REGIONS[k] * share), REGIONS[k] - 1)
+                number = REGIONS[k] * number + place
             regions[i] = number
     return regions
 
@@ -164,12 +172,12 @@ def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -
     theta is the rotation from the gyro's; ``Lambda^-1 - C_theta`` is its covariance, and the rates
     have ``6 - tr(C_w) / s_w^2`` degrees of freedom, if gyro and images are both right.
     """
-    chi2, freedom = 0.0, 0.0
+    chi2 = 0.0
+    freedom = 0.0
     if prior.rotation_information[0, 0] > 0.0:
         theta = so3.log_so3(state.R @ prior.rotation.T)
-        away = (1.0 + LEAST_DISAGREEMENT) * inverse(prior.rotation_information) - covariance[
-            :3, :3
-        ]
+        by_gyro = (1.0 + LEAST_DISAGREEMENT) * inverse(prior.rotation_information)
+        away = by_gyro - covariance[:3, :3]
         chi2 += (theta * (inverse(away) @ theta)).sum()
         freedom += 3.0
     chi2 += prior.rate_weight * ((state.dw1**2).sum() + (state.dw2**2).sum())
@@ -181,10 +189,10 @@ def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -
 
 def local_covariance(matches: FitMatches, state: TwoViewState, prior: Priors) -> Array:
     """Covariance (17, 17) of the local parameters from the regularised Hessian."""
-    hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
-    local = inverse(hessian)
-    # Error of a state that is not the optimum: about this step.
-    step = local @ gradient
+    whole = with_priors(linearised(matches, state), state, prior)
+    local = inverse(whole.hessian)
+    # The error of a state that is not the optimum is about this step.
+    step = local @ whole.gradient
     return np.asarray(local + np.outer(step, step))
 
 
@@ -197,26 +205,26 @@ def pair_state(
     (n, n): covariance of the local parameters ``(theta, tangent, d_1, d_2, dw_1, dw_2)``, in frame
     1, and of `log_scale` if it is unknown.
     """
-    jacobian = np.zeros((19, len(local)))
-    jacobian[0:3, 3:5] = so3.tangent_basis(state.t)
-    jacobian[3:6, 0:3] = np.eye(3)
-    jacobian[6:9, 5:8] = np.eye(3)
-    # v_2 = R^T d_2, w_2 = w + R^T dw_2: they rotate with the error of R.
-    jacobian[9:12, 8:11] = state.R.T
-    jacobian[9:12, 0:3] = state.R.T @ so3.skew(state.d2)
-    jacobian[12:15, 11:14] = np.eye(3)
-    jacobian[15:18, 14:17] = state.R.T
-    if len(local) > SCALE:
-        jacobian[18, SCALE] = 1.0
-    w1 = problem.motion1.angular_velocity + state.dw1
-    w2 = problem.motion2.angular_velocity + state.R.T @ state.dw2
+    eye = np.eye(3)
+    R_back = state.R.T
+    t, theta, v1, v2, w1, w2, log_baseline = PARTS.values()
+    jacobian = np.zeros((log_baseline.stop, len(local)))
+    jacobian[t, TANGENT:D1] = so3.tangent_basis(state.t)
+    jacobian[theta, THETA:TANGENT] = eye
+    jacobian[v1, D1:D2] = eye
+    # v_2 = R^T d_2 and w_2 = w + R^T dw_2 rotate with the error of R.
+    jacobian[v2, D2:DW1] = R_back
+    jacobian[v2, THETA:TANGENT] = R_back @ so3.skew(state.d2)
+    jacobian[w1, DW1:DW2] = eye
+    jacobian[w2, DW2:PARAMETERS] = R_back
+    jacobian[log_baseline, SCALE:] = 1.0
     return PairState(
         state.R,
         state.t,
         state.d1,
-        state.R.T @ state.d2,
-        w1,
-        w2,
+        R_back @ state.d2,
+        problem.motion1.angular_velocity + state.dw1,
+        problem.motion2.angular_velocity + R_back @ state.dw2,
         log_scale,
         jacobian @ local @ jacobian.T,
     )
@@ -233,9 +241,11 @@ def pair_state(
 # H may be singular: a global shutter does not observe velocities. The prior of the gyro's rate
 # during the readout stays in it: without, rays have no common row.
 
-# Deviations of a rotation alone, of a pose without velocities, and of a pose with velocities.
+# Number of deviations of a rotation alone. [derived: the order of the unknowns]
 ROTATION = TANGENT
+# Number of deviations of a pose without velocities. [derived: the order of the unknowns]
 DIRECTION = D1
+# Number of deviations of a pose with velocities. [derived: the order of the unknowns]
 POSE = DW1
 # Deviations that move the estimate of the images alone. Their time offset is of the stamped row,
 # as the parameter; the deviations of the gyro are unknowns of whoever integrates it.
@@ -280,9 +290,8 @@ class ImageInformation:
 
     def enlarged(self, factor: float) -> ImageInformation:
         """The same with its covariance times a factor."""
-        return replace(
-            self, information=self.information / factor, gradient=self.gradient / factor
-        )
+        information = self.information / factor
+        return replace(self, information=information, gradient=self.gradient / factor)
 
     def _reduced(self, kept: int) -> ImageInformation:
         """Keep the first deviations."""
@@ -301,20 +310,23 @@ def image_information(
 ) -> ImageInformation:
     """Of the matches of a fit, with the rates' part of its `prior` only."""
     H, g = _of_pose(matches, state, prior)
-    return ImageInformation(row_time, state.R, state.t, np.concatenate([state.d1, state.d2]), H, g)
+    velocities = np.concatenate([state.d1, state.d2])
+    return ImageInformation(row_time, state.R, state.t, velocities, H, g)
 
 
 @kernel
 def _of_pose(matches: FitMatches, state: TwoViewState, prior: Priors) -> tuple[Array, Array]:
     """Information (11, 11) and gradient (11,) of the pose, the rates eliminated."""
     data = linearised(matches, state)
-    H, g = data.hessian, data.gradient
+    H = data.hessian
+    g = data.gradient
     # With the errors by image regions instead of those of the Hessian: H S^-1 H.
-    S = score_of_matches(matches, state, H, with_priors(data, state, prior)[0])
+    whole = with_priors(data, state, prior)
+    S = score_of_matches(matches, state, H, whole.hessian)
     floor = _RANK * (np.trace(S) + 6.0 * prior.rate_weight)
     for i in range(3):
         g[DW1 + i] += prior.rate_weight * state.dw1[i]
-        g[priors.DW2 + i] += prior.rate_weight * state.dw2[i]
+        g[DW2 + i] += prior.rate_weight * state.dw2[i]
     for i in range(DW1, PARAMETERS):
         H[i, i] += prior.rate_weight
         S[i, i] += prior.rate_weight
@@ -328,6 +340,6 @@ def rotation_information(
     R: Array, information: Array, prior: Array, theta: Array, row_time: float
 ) -> ImageInformation:
     """Of a fit of a rotation alone with a `prior` (3, 3) at the distance `theta` (3,)."""
-    return ImageInformation(
-        row_time, R, np.full(3, np.nan), np.full(6, np.nan), information - prior, -(prior @ theta)
-    )
+    unknown = np.full(9, np.nan)
+    gradient = -(prior @ theta)
+    return ImageInformation(row_time, R, unknown[:3], unknown[3:], information - prior, gradient)

@@ -21,12 +21,13 @@ from rs_relpose_ros.estimator import (
 )
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
-from rs_relpose_ros.estimator.problem import to_reference_row
+from rs_relpose_ros.estimator.problem import PARTS, to_reference_row
 from rs_relpose_ros.estimator.result import Diagnostics, landmarks, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import SolverMode
-from rs_relpose_ros.estimator.sampson import RayMatches
+from rs_relpose_ros.estimator.sampson import FitMatches, VIEW_1, VIEW_2
 from rs_relpose_ros.estimator.velocity import Refined
 from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.solvers.common import Solutions
 
 # Prior sigma of the velocities while hypotheses are compared [baselines per second]. With less,
@@ -40,8 +41,6 @@ ENOUGH = 0.5
 # Share of inliers at which the gyro's rotation with one direction of translation needs no other
 # hypothesis. [chosen: between ENOUGH and the share of a clean pair]
 CERTAIN = 0.75
-# First columns of the rays f_1 and f_2 in an observation.
-RAYS = (0, 9)
 # A rotation alone explains matches that it leaves within this many sigmas in the median: pairs
 # below have no direction of translation. [derived: the noise of |f_1 - R f_2| is 1.67 sigma in the
 # median (Rayleigh, two images), and a parallax of as much again is in doubt]
@@ -95,21 +94,9 @@ def evidence_for_inertial(
     if pose.images is None or interval is None:
         return None
     motion = problem.config.motion
-    views = problem.without_matches().two_views()
-    inertial = problem.inertial[-1]
-    expected, _ = velocity.expected_velocities(
-        views,
-        motion,
-        interval,
-        inertial,
-    )
-    return velocity.inertial_evidence(
-        views,
-        pose.images,
-        motion,
-        interval,
-        expected,
-    )
+    views = replace(problem, matches=Matches.none()).two_views()
+    expected, _ = velocity.expected_velocities(views, motion, interval, problem.inertial[-1])
+    return velocity.inertial_evidence(views, pose.images, motion, interval, expected)
 
 
 def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> RelativePose:
@@ -117,17 +104,12 @@ def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> Rela
     camera = problem.camera
     rays = []
     row_times = []
-    for points, motion in zip(
-        problem.matches.points[[0, -1]], (problem.motions[0], problem.motions[-1]), strict=True
-    ):
-        row_times.append(camera.row_times(points[:, 1]))
-        rays.append(motion.derotate(camera.unproject(points), row_times[-1]))
-    found = landmarks(
-        pose,
-        np.stack(rays),
-        np.stack(row_times),
-        camera,
-    )
+    for image in (0, -1):
+        points = problem.matches.points[image]
+        tau = camera.row_times(points[:, 1])
+        rays.append(problem.motions[image].derotate(camera.unproject(points), tau))
+        row_times.append(tau)
+    found = landmarks(pose, np.stack(rays), np.stack(row_times), camera)
     return replace(pose, pixels1_gs=found.pixels1, pixels2_gs=found.pixels2)
 
 
@@ -163,8 +145,8 @@ class Estimation:
         order = np.argsort(-pair.matches.quality, kind='stable')
         self.order = order[problem.valid[order]]
         self.seed = np.array([pair.seed], dtype=np.uint64)
-        self.matches = RayMatches(
-            problem.observations, problem.valid, config.pixel_sigma / problem.focal
+        self.matches = FitMatches(
+            problem.observations, problem.valid.astype(float), config.pixel_sigma, problem.focal
         )
         self.interval = pair.interval
         self.inertial = pair.inertial[-1]
@@ -179,8 +161,10 @@ class Estimation:
         self.deadline = time.perf_counter() + limit if limit > 0.0 else math.inf
         # Whether solvers were skipped, since one before them had enough inliers.
         self.solvers_skipped = False
-        # The state on its inliers, after step 3.
+        # The state on its inliers, and the residuals (N,) of all matches at this state [px], after
+        # step 3.
         self.refined: Refined
+        self.residuals: Array
 
     def run(self) -> RelativePose:
         """The pose of two views, or the reason why there is none.
@@ -233,6 +217,7 @@ class Estimation:
         """Steps 3 to 5, from the best state."""
         # 3. Refinement on its inliers.
         self.refined = self._refined(state)
+        self.residuals = sampson.residuals(self.matches.observations, self.refined.state)
         if reason := self._no_consensus():
             return self._failure(Status.NO_CONSENSUS, reason)
         if reason := self._contradiction():
@@ -252,9 +237,8 @@ class Estimation:
         if self.config.refinement != 'map':
             return ''
         use = self.refined.inliers
-        residuals = sampson.residuals(self.problem.observations, self.refined.state)
         count = np.count_nonzero(use)
-        within = np.abs(residuals[~use]) < self.config.threshold
+        within = np.abs(self.residuals[~use]) < self.config.threshold
         others = np.count_nonzero(within)
         if count - others >= SIGN_SIGMAS * math.sqrt(count + others):
             return ''
@@ -278,16 +262,14 @@ class Estimation:
         if config.refinement != 'map':
             # As in the paper: the best hypothesis, unchanged.
             return self._in_front(priors.hypothesis_state(hypotheses.R[0], hypotheses.x[0]))
-        state, found = sampling.optimise(
-            self.matches, hypotheses, self.priors, config.pixel_sigma, config.threshold
-        )
+        state, found = sampling.optimise(self.matches, hypotheses, self.priors, config.threshold)
         return state if found else None
 
     def _in_front(self, state: TwoViewState) -> TwoViewState:
         """The state or its mirror image, whichever has more matches in front of the cameras."""
         observations = self.matches.observations
         errors = np.abs(sampson.residuals(observations, state))
-        use = (errors < self.config.threshold * sampling.SCALES[1]) & self.matches.valid
+        use = (errors < self.config.threshold * sampling.SCALES[1]) & self.problem.valid
         return priors.signed(state, sampson.cheirality_sign(observations, use, state))
 
     def _refined(self, state: TwoViewState) -> Refined:
@@ -298,21 +280,14 @@ class Estimation:
         if config.refinement == 'map':
             prior, scales = self._velocities(model.velocities or model.derotated)
             return velocity.fit_with_evidence(
-                matches,
-                state,
-                prior,
-                config.pixel_sigma,
-                config.threshold,
-                scales,
-                self._gyro_error(),
+                matches, state, prior, config.threshold, scales, self._gyro_error()
             )
         use = sampson.select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and use.sum() >= LEAST_ALTERNATING:
-            weights = use.astype(float)
-            data = fit.FitMatches(matches.observations, weights, config.pixel_sigma)
-            state = self._in_front(fit.refine_alternating(data, state, model.velocities))
+            used = matches._replace(weights=use.astype(float))
+            state = self._in_front(fit.refine_alternating(used, state, model.velocities))
             use = sampson.select_inliers(matches, state, config.threshold)
-        data = fit.FitMatches(matches.observations, use.astype(float), config.pixel_sigma)
+        used = matches._replace(weights=use.astype(float))
         log_scale = self.priors.velocity.log_scale
         return Refined(
             state,
@@ -320,7 +295,7 @@ class Estimation:
             log_scale,
             math.exp(-log_scale),
             config.pixel_sigma,
-            covariance.local_covariance(data, state, self.priors),
+            covariance.local_covariance(used, state, self.priors),
         )
 
     def _velocities(self, free: bool) -> tuple[Priors, velocity.Scales]:
@@ -336,7 +311,7 @@ class Estimation:
             self.measured = expected
         offset = expected.offset
         self.inertial_chi2 = float(offset @ expected.information @ offset)
-        return priors.with_velocity(self.priors, expected), scales
+        return self.priors._replace(velocity=expected), scales
 
     def _gyro_error(self) -> Array:
         """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
@@ -357,19 +332,12 @@ class Estimation:
     def _no_consensus(self) -> str:
         """Reason why the inliers determine no pose; empty if they may."""
         config = self.config
-        observations = self.problem.observations
+        observations = self.matches.observations
         use = self.refined.inliers
         total = len(self.order)
-        cell = config.threshold / self.problem.focal  # [rad]
-        count = min(
-            sampling.distinct_directions(
-                observations,
-                use,
-                f,
-                cell,
-            )
-            for f in RAYS
-        )
+        cell = config.threshold / self.matches.focal  # [rad]
+        rays = (VIEW_1, VIEW_2)
+        count = min(sampling.distinct_directions(observations, use, ray, cell) for ray in rays)
         expected = total * min(CHANCE_SHARE * cell, MOST_BY_CHANCE)
         most = int(expected + CHANCE_SIGMAS * np.sqrt(expected))
         chance = most + self.mode.fitted_points
@@ -378,7 +346,7 @@ class Estimation:
                 f'{count} distinct of {total} matches agree, fewer than '
                 f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)'
             )
-        spread = min(sampling.distance_from_a_plane(observations, use, f) for f in RAYS)
+        spread = min(sampling.distance_from_a_plane(observations, use, ray) for ray in rays)
         if spread < DEGENERATE_THRESHOLDS * cell:
             return f'the {count} matches that agree lie on one line: the pose is not observable'
         return ''
@@ -389,12 +357,7 @@ class Estimation:
         if self.config.refinement != 'map' or problem.rotation is None:
             return ''
         state = self.refined.state
-        gain, R = sampling.gain_without_gyro(
-            self.matches,
-            state,
-            self.priors,
-            problem.focal,
-        )
+        gain, R = sampling.gain_without_gyro(self.matches, state, self.priors)
         if gain < CONTRADICTION:
             return ''
         apart = np.degrees(np.linalg.norm(so3.log_so3(R @ state.R.T)))
@@ -409,54 +372,33 @@ class Estimation:
         In front of a far plane a rotation alone may absorb nearly all of the motion, so it must
         fit the matches to within their noise, not to within some pixels.
         """
-        config = self.config
-        focal = self.problem.focal
-        observations = self.problem.observations
+        focal = self.matches.focal
+        observations = self.matches.observations
         use = self.refined.inliers
+        sigma = self.refined.sigma
         R = np.ascontiguousarray(self.refined.state.R)
-        parallax = so3.median(
-            fit.transfer_errors(
-                observations,
-                use,
-                R,
-                focal,
-            )
-        )
+        parallax = so3.median(fit.transfer_errors(observations, use, R, focal))
         # Not from the rotation of the pose, which is arbitrary for points on a line.
-        start = so3.aligning_rotation(sampling.correlation(observations, use, *RAYS))
-        R, information = fit.fit_rotation(
-            observations, use, start, self.priors, focal, self.refined.sigma
-        )
-        residuals = fit.transfer_errors(
-            observations,
-            use,
-            R,
-            focal,
-        )
+        of_rays = sampling.correlation(observations, use, VIEW_1, VIEW_2)
+        start = so3.aligning_rotation(of_rays)
+        R, information = fit.fit_rotation(observations, use, start, self.priors, focal, sigma)
+        residuals = fit.transfer_errors(observations, use, R, focal)
         rms = float(np.sqrt(np.mean(residuals**2)))
         median = so3.median(residuals)
-        if median < ROTATION_ONLY_SIGMAS * self.refined.sigma:
+        least = self.config.min_parallax
+        if median < ROTATION_ONLY_SIGMAS * sigma:
             status = Status.PURE_ROTATION
             reason = (
                 f'a rotation alone leaves {median:.2f} px in the median, the noise of '
                 'the matches: the translation is not observable'
             )
-        elif parallax < config.min_parallax:
+        elif parallax < least:
             status = Status.LOW_PARALLAX
-            reason = (
-                f'median parallax of {parallax:.2f} px is below min_parallax = '
-                f'{config.min_parallax:g} px'
-            )
+            reason = f'median parallax of {parallax:.2f} px is below min_parallax = {least:g} px'
         else:
             return None
         pose = self._rotation(R, information)
-        diagnostics = replace(pose.diagnostics, residual_rms=rms)
-        return replace(
-            pose,
-            status=status,
-            reason=reason,
-            diagnostics=diagnostics,
-        )
+        return replace(pose, status=status, reason=reason).diagnosed(residual_rms=rms)
 
     def _rotation(self, R: Array, information: Array) -> RelativePose:
         """The result of a rotation (3, 3) between the middle rows, with its information (3, 3)."""
@@ -513,11 +455,11 @@ class Estimation:
         )
         turns = self._rotations_to_reference_row(refined.state)
         pose = to_reference_row(at_middle, problem.reference_row_time, *turns)
-        residuals = sampson.residuals(problem.observations, refined.state)
+        rms = np.sqrt(np.mean(self.residuals[refined.inliers] ** 2))
         images = self._images()
-        sigma = math.sqrt(max(pose.covariance[18, 18], 0.0))
+        sigma = math.sqrt(max(pose.covariance[-1, -1], 0.0))
         no_baseline = self._no_baseline(sigma)
-        v2w2 = np.r_[9:12, 15:18]
+        of_second = np.r_[PARTS['v2'], PARTS['w2']]
         return RelativePose(
             status=Status.OK,
             R=pose.R,
@@ -527,7 +469,7 @@ class Estimation:
             linear_velocity2=pose.v2,
             angular_velocity1=pose.w1,
             angular_velocity2=pose.w2,
-            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)],
+            velocity_covariance=pose.covariance[np.ix_(of_second, of_second)],
             baseline=math.nan if no_baseline else math.exp(pose.log_baseline),
             baseline_log_sigma=math.nan if no_baseline else sigma,
             inliers=refined.inliers,
@@ -535,7 +477,7 @@ class Estimation:
             diagnostics=Diagnostics(
                 model=self.mode.model.name,
                 iterations=self.iterations,
-                residual_rms=float(np.sqrt(np.mean(residuals[refined.inliers] ** 2))),
+                residual_rms=float(rms),
                 pixel_sigma=refined.sigma,
                 velocity_sigma=refined.velocity_sigma,
                 baseline_reason=no_baseline,
@@ -547,20 +489,12 @@ class Estimation:
         """Information of the images alone; None for models without all unknowns."""
         if not self.mode.model.derotated:
             return None
-        observations = self.problem.observations
         weights, sigma = noise_mixture(
-            sampson.residuals(observations, self.refined.state),
-            self.refined.inliers,
-            self.config.pixel_sigma,
+            self.residuals, self.refined.inliers, self.config.pixel_sigma
         )
-        data = fit.FitMatches(observations, weights, sigma)
+        used = self.matches._replace(weights=weights, sigma=sigma)
         row_time = -self.problem.reference_row_time
-        return covariance.image_information(
-            data,
-            self.refined.state,
-            self.priors,
-            row_time,
-        )
+        return covariance.image_information(used, self.refined.state, self.priors, row_time)
 
     def _evidence(
         self, images: covariance.ImageInformation | None

@@ -10,95 +10,99 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.core.least_squares import damped_step
 from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.estimator.sampson import FitMatches, VIEW_2
+from rs_relpose_ros.geometry import Array, Flags, so3
 from rs_relpose_ros.jit import kernel
 
-# Damping of the first step, as a share of the diagonal of the Hessian.
+# Damping of the first step, as a share of the diagonal of the Hessian. Less lets a first step from
+# a bad start go too far, more costs steps. [chosen: any value in 1e-5..1e-2 would do, because the
+# damping adapts itself]
 FIRST_DAMPING = 1e-4
-# A fit ends if a step gains less than this share of 1 + cost (chi-square).
+# A fit ends if a step gains less than this share of 1 + cost (chi-square). A larger share stops
+# before the optimum, a smaller one takes steps of rounding. [chosen: far below the change of 1
+# that a sigma makes; any value in 1e-9..1e-5 would do]
 LEAST_GAIN = 1e-7
 
 
-class FitMatches(NamedTuple):
-    """The matches of a fit."""
+class NormalEquations(NamedTuple):
+    """An objective about one state: of the matches alone, or with priors."""
 
-    observations: Array  # (N, 20)
-    weights: Array  # (N,) 0 to 1
-    sigma: float  # noise [px] of a match of weight 1
-
-
-class DataTerm(NamedTuple):
-    """The objective about one state without priors, so that fits with other priors share it."""
-
-    hessian: Array
-    gradient: Array
+    hessian: Array  # (n, n)
+    gradient: Array  # (n,) half of it
     cost: float
 
 
 @kernel
-def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
-    """Hessian (17, 17), half gradient (17,) and cost of the matches about `state`."""
+def linearised(matches: FitMatches, state: TwoViewState) -> NormalEquations:
+    """The objective of the matches alone about `state`, without any prior; n is 17."""
     hessian, gradient, squares = sampson.normal_equations(
         matches.observations, matches.weights, state
     )
     weight = 1.0 / (matches.sigma * matches.sigma)
-    return DataTerm(hessian * weight, gradient * weight, squares * weight)
+    return NormalEquations(hessian * weight, gradient * weight, squares * weight)
 
 
 @kernel
-def with_priors(data: DataTerm, state: TwoViewState, prior: Priors) -> tuple[Array, Array, float]:
-    """Hessian (n, n), half gradient (n,) and cost of the whole objective at `state`."""
+def with_priors(data: NormalEquations, state: TwoViewState, prior: Priors) -> NormalEquations:
+    """The whole objective at `state`, from the objective of the matches."""
     n = priors.unknowns(prior)
-    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+    hessian = np.zeros((n, n))
+    gradient = np.zeros(n)
     so3.copy_vector(data.gradient, gradient)
     so3.copy_matrix(data.hessian, hessian)
-    cost = data.cost + priors.add_priors(state, prior, hessian, gradient)
-    return hessian, gradient, cost
+    of_priors = priors.add_priors(state, prior, hessian, gradient)
+    return NormalEquations(hessian, gradient, data.cost + of_priors)
 
 
 @kernel
 def fit(
-    matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors, iterations: int
-) -> tuple[TwoViewState, float, DataTerm, float, Array]:
-    """Levenberg-Marquardt from `start`, about which `data` is, and the scale of `prior`.
+    matches: FitMatches,
+    start: TwoViewState,
+    data: NormalEquations,
+    prior: Priors,
+    iterations: int,
+) -> tuple[TwoViewState, float, NormalEquations, NormalEquations]:
+    """Minimise by Levenberg-Marquardt from `start`, about which `data` is.
 
-    Returns the state, the logarithm of the velocities' scale, the data term about that state, and
-    the cost and Hessian (n, n) of the whole objective.
+    The scale of the velocities starts at the scale of `prior`. Returns the state, the logarithm of
+    the scale, and the objectives of the matches and of everything about that state.
     """
-    state, n = start, priors.unknowns(prior)
+    state = start
+    n = priors.unknowns(prior)
     damping = FIRST_DAMPING
-    hessian, gradient, cost = with_priors(data, state, prior)
+    whole = with_priors(data, state, prior)
     for _ in range(iterations):
-        step, expected_gain = damped_step(hessian, gradient, damping)
+        step, expected_gain = damped_step(whole.hessian, whole.gradient, damping)
         if expected_gain < 0.0:  # singular
             damping = max(damping * 10.0, 1e-6)
             continue
-        if expected_gain < LEAST_GAIN * (1.0 + abs(cost)):
+        if expected_gain < LEAST_GAIN * (1.0 + abs(whole.cost)):
             break
-        candidate, candidate_prior = priors.moved(state, step), prior
+        candidate = priors.moved(state, step)
+        candidate_prior = prior
         if n > SCALE:
             velocity = prior.velocity
-            candidate_prior = priors.at_scale(
-                prior, velocity.log_scale + step[SCALE], velocity.centre, velocity.freedom
-            )
-        # Most steps are accepted: their derivatives cost little more than the residuals alone.
-        next_data = linearised(matches, candidate)
-        next_hessian, next_gradient, next_cost = with_priors(next_data, candidate, candidate_prior)
-        if next_cost <= cost:
-            state, data, prior = candidate, next_data, candidate_prior
-            hessian, gradient, cost = next_hessian, next_gradient, next_cost
+            log_scale = velocity.log_scale + step[SCALE]
+            candidate_prior = priors.at_scale(prior, log_scale, velocity.centre, velocity.freedom)
+        # Most steps are accepted, and derivatives cost little more than the residuals alone.
+        candidate_data = linearised(matches, candidate)
+        candidate_whole = with_priors(candidate_data, candidate, candidate_prior)
+        if candidate_whole.cost <= whole.cost:
+            state = candidate
+            data = candidate_data
+            prior = candidate_prior
+            whole = candidate_whole
             damping = max(damping * 0.1, 1e-9)
         else:
             damping *= 10.0
             if not damping < 1e8:
                 break
-    return state, prior.velocity.log_scale, data, cost, hessian
+    return state, prior.velocity.log_scale, data, whole
 
 
 @kernel
@@ -108,8 +112,8 @@ def gauss_newton(
     """The state after some Gauss-Newton steps from `start`, without a test of the cost."""
     state = start
     for _ in range(steps):
-        hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
-        step, expected_gain = damped_step(hessian, gradient, FIRST_DAMPING)
+        whole = with_priors(linearised(matches, state), state, prior)
+        step, expected_gain = damped_step(whole.hessian, whole.gradient, FIRST_DAMPING)
         if expected_gain < 0.0:  # singular
             break
         state = priors.moved(state, step)
@@ -118,19 +122,23 @@ def gauss_newton(
 
 # -- Refinement of the paper (its section 'Refinement'), as a selectable mode ---------------------
 #
-# Alternates between the rotation and ``(t, d_1, d_2)``: minimises the squared Sampson errors plus
-# ``l_t (|t| - 1)^2 + l_d (|d_1|^2 + |d_2|^2)``. Errors do not depend on the common scale of
-# ``(t, d_1, d_2)``: here ``|t| = 1``, the limit of a large l_t.
+# The refinement alternates between the rotation and ``(t, d_1, d_2)``. It minimises the squared
+# Sampson errors plus ``l_t (|t| - 1)^2 + l_d (|d_1|^2 + |d_2|^2)``. Errors do not depend on the
+# common scale of ``(t, d_1, d_2)``, so that ``|t| = 1`` here, the limit of a large l_t.
 
-# l_d, with residuals in units of the pixel noise; the paper gives no value.
+# The weight l_d, with residuals in units of the pixel noise. A larger one pulls the velocities to
+# zero, a smaller one lets them follow the noise. [chosen: the paper gives no value; a velocity of
+# ten baselines per second then costs as much as one residual of one sigma]
 VELOCITY_WEIGHT = 1e-2
+# Most alternations: the loop ends earlier if they gain nothing. [chosen: any value in 5..20]
 ALTERNATIONS = 10
 
 
 @kernel
 def refine_alternating(matches: FitMatches, start: TwoViewState, velocities: bool) -> TwoViewState:
     """Refine a state by alternation; gyro corrections, and d without `velocities`, are kept."""
-    state, cost = start, math.inf
+    state = start
+    cost = math.inf
     for _ in range(ALTERNATIONS):
         previous = cost
         state, _ = _refine_part(matches, state, 0, priors.TANGENT)
@@ -146,25 +154,30 @@ def _refine_part(
     matches: FitMatches, state: TwoViewState, first: int, end: int
 ) -> tuple[TwoViewState, float]:
     """Levenberg-Marquardt over the unknowns from `first` to before `end`; also the cost."""
-    hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    hessian = np.zeros((PARAMETERS, PARAMETERS))
+    gradient = np.zeros(PARAMETERS)
     step = np.zeros(PARAMETERS)
-    candidate, cost, damping = state, math.inf, FIRST_DAMPING
+    candidate = state
+    cost = math.inf
+    damping = FIRST_DAMPING
     for _ in range(60):
         data = linearised(matches, candidate)
         d = np.concatenate((candidate.d1, candidate.d2))
         total = data.cost + VELOCITY_WEIGHT * (d * d).sum()
         damping *= 0.1 if total <= cost else 10.0
         if total <= cost:
-            gain, state, cost = cost - total, candidate, total
+            gain = cost - total
+            state = candidate
+            cost = total
             if gain <= 1e-8 * cost:
                 break
-            hessian, gradient = data.hessian, data.gradient
+            hessian = data.hessian
+            gradient = data.gradient
             gradient[priors.D1 : priors.DW1] += VELOCITY_WEIGHT * d
             for i in range(priors.D1, priors.DW1):
                 hessian[i, i] += VELOCITY_WEIGHT
-        part, expected_gain = damped_step(
-            hessian[first:end, first:end].copy(), gradient[first:end], damping
-        )
+        own = hessian[first:end, first:end].copy()
+        part, expected_gain = damped_step(own, gradient[first:end], damping)
         if expected_gain < 0.0:  # singular
             break
         step[first:end] = part
@@ -172,23 +185,27 @@ def _refine_part(
     return state, cost
 
 
-# -- Rotation alone: a robust fit with the gyro's prior -------------------------------------------
+# -- Rotation alone: a robust fit with the prior of the gyro --------------------------------------
 
+# Most iterations: the weights change from one to the next, so that a dozen converge.
+# [chosen: the loop ends earlier if the step is small; any value in 8..30 would do]
 ROTATION_ITERATIONS = 12
 
 
 @kernel
-def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array, focal: float) -> Array:
+def transfer_errors(observations: Array, use: Flags, R: Array, focal: float) -> Array:
     """``|f_1 - R f_2|`` [px] of the matches in `use`: their residual motion after a rotation."""
     out = np.empty(use.sum())
     count = 0
-    for i in range(observations.shape[0]):
+    for i in range(len(use)):
         if use[i]:
+            f1 = observations[i]
+            f2 = observations[i, VIEW_2:]
             total = 0.0
             for j in range(3):
-                value = observations[i, j]
+                value = f1[j]
                 for k in range(3):
-                    value -= R[j, k] * observations[i, 9 + k]
+                    value -= R[j, k] * f2[k]
                 total += value * value
             out[count] = focal * math.sqrt(total)
             count += 1
@@ -198,15 +215,16 @@ def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array, focal
 @kernel
 def fit_rotation(
     observations: Array,
-    valid: NDArray[np.bool_],
+    use: Flags,
     start: Array,
     prior: Priors,
     focal: float,
     sigma: float,
 ) -> tuple[Array, Array]:
-    """Rotation (3, 3) and the information (3, 3) of its error in frame 1.
+    """Fit a rotation (3, 3); also the information (3, 3) of its error in frame 1.
 
-    Iteratively reweighted (Cauchy, scale 2 sigma); the prior on the rotation is the gyro's.
+    The matches in `use` are weighted iteratively (Cauchy, scale 2 sigma). Of the `prior`, only the
+    rotation of the gyro is used.
     """
     R = start.copy()
     information = np.zeros((3, 3))
@@ -216,19 +234,20 @@ def fit_rotation(
     for _ in range(ROTATION_ITERATIONS):
         hessian = prior.rotation_information.copy()
         gradient = prior.rotation_information @ so3.log_so3(R @ prior.rotation.T)
-        for i in range(observations.shape[0]):
-            if not valid[i]:
+        for i in range(len(use)):
+            if not use[i]:
                 continue
-            o = observations[i]
-            h = so3.rotated(R, o[9:12])
-            d = (o[0] - h[0], o[1] - h[1], o[2] - h[2])
-            w = weight * cauchy_weight(weight * so3.dot(d, d) / scale2)
+            h = so3.rotated(R, observations[i, VIEW_2:])
+            d = so3.subtract(observations[i], h)
+            q = weight * so3.dot(d, d)
+            w = weight * cauchy_weight(q / scale2)
             # d(f_1 - h) = -theta x h: gradient -(h x (f_1 - h)), Hessian |h|^2 I - h h^T
             turn = so3.cross(h, d)
             for j in range(3):
-                k, m = (j + 1) % 3, (j + 2) % 3
+                next_1 = h[(j + 1) % 3]
+                next_2 = h[(j + 2) % 3]
                 gradient[j] -= w * turn[j]
-                hessian[j, j] += w * (h[k] * h[k] + h[m] * h[m])
+                hessian[j, j] += w * (next_1 * next_1 + next_2 * next_2)
                 for k in range(j):
                     hessian[k, j] -= w * h[k] * h[j]
                     hessian[j, k] = hessian[k, j]

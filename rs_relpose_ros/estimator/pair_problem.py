@@ -64,7 +64,3 @@ class PairProblem:
             self.covariances[-1] if known else None,
             derotated,
         )
-
-    def without_matches(self) -> PairProblem:
-        """The motion of the pair alone."""
-        return replace(self, matches=Matches.none())

@@ -29,17 +29,23 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
 from rs_relpose_ros.jit import kernel, small_kernel
 
-# First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
-# plane, and four vectors. The logarithm of the velocities' scale follows after them if it is
-# unknown, too.
+# First local parameter of each unknown.
 _UNKNOWNS = first_indices(theta=3, tangent=2, d1=3, d2=3, dw1=3, dw2=3, scale=1)
+# Rotation vector on the left of R. [derived: the order of the unknowns, as all of these]
 THETA = _UNKNOWNS['theta']
+# Two steps of t in its tangent plane. [derived: the same]
 TANGENT = _UNKNOWNS['tangent']
+# Velocity of camera 1. [derived: the same]
 D1 = _UNKNOWNS['d1']
+# Velocity of camera 2. [derived: the same]
 D2 = _UNKNOWNS['d2']
+# Correction of the rate of camera 1. [derived: the same]
 DW1 = _UNKNOWNS['dw1']
+# Correction of the rate of camera 2. [derived: the same]
 DW2 = _UNKNOWNS['dw2']
+# Logarithm of the scale of the velocities, if that is unknown, too. [derived: the same]
 SCALE = _UNKNOWNS['scale']
+# Number of the unknowns of a state, without the scale. [derived: the same]
 PARAMETERS = SCALE
 
 
@@ -60,25 +66,28 @@ class TwoViewState(NamedTuple):
 @kernel
 def hypothesis_state(R: Array, x: Array) -> TwoViewState:
     """The state of a hypothesis: R (3, 3) and ``x = (t, d_1, d_2)``, gyro as measured."""
-    return TwoViewState(
-        R.copy(), x[0:3].copy(), x[3:6].copy(), x[6:9].copy(), np.zeros(3), np.zeros(3)
-    )
+    t = x[0:3].copy()
+    d1 = x[3:6].copy()
+    d2 = x[6:9].copy()
+    return TwoViewState(R.copy(), t, d1, d2, np.zeros(3), np.zeros(3))
 
 
 @kernel
 def signed(state: TwoViewState, sign: float) -> TwoViewState:
     """The state with its translation and velocities multiplied by `sign`."""
-    return TwoViewState(
-        state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1, state.dw2
-    )
+    t = sign * state.t
+    d1 = sign * state.d1
+    d2 = sign * state.d2
+    return TwoViewState(state.R, t, d1, d2, state.dw1, state.dw2)
 
 
 @kernel
 def moved(state: TwoViewState, step: Array) -> TwoViewState:
     """The state after a step (17,) of its local parameters."""
+    R = exp_so3(step[THETA:TANGENT]) @ state.R
     t = state.t + tangent_basis(state.t) @ step[TANGENT:D1]
     return TwoViewState(
-        exp_so3(step[THETA:TANGENT]) @ state.R,
+        R,
         t / norm(t),
         state.d1 + step[D1:D2],
         state.d2 + step[D2:DW1],
@@ -92,20 +101,16 @@ def step_between(state: TwoViewState, other: TwoViewState) -> Array:
     """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
     turn = log_so3(other.R @ state.R.T)
     tangent = other.t @ tangent_basis(state.t) / dot(state.t, other.t)
-    return np.concatenate(
-        (
-            turn,
-            tangent,
-            other.d1 - state.d1,
-            other.d2 - state.d2,
-            other.dw1 - state.dw1,
-            other.dw2 - state.dw2,
-        )
-    )
+    d1 = other.d1 - state.d1
+    d2 = other.d2 - state.d2
+    dw1 = other.dw1 - state.dw1
+    dw2 = other.dw2 - state.dw2
+    return np.concatenate((turn, tangent, d1, d2, dw1, dw2))
 
 
-# A weight that fixes its unknowns: the angular, linear and global models as cases of the uniform
-# one.
+# A weight that fixes its unknowns, so that the angular, linear and global models are cases of the
+# uniform one. A smaller weight would leave the unknowns some freedom, a larger one would lose the
+# digits of the others. [chosen: 1e-7 of a unit; any value in 1e12..1e16 would do]
 PINNED = 1e14
 
 
@@ -116,8 +121,8 @@ class VelocityPrior(NamedTuple):
     offset: Array  # a (6,)
     information: Array  # W (6, 6)
     log_scale: float  # current ``log b``
-    centre: float  # mean of its prior, and its inverse variance: 0 if it is known
-    weight: float
+    centre: float  # mean of the prior of ``log b``
+    weight: float  # inverse variance of the same; 0 if b is known
     freedom: float  # g, as above
 
 
@@ -135,8 +140,9 @@ class Priors(NamedTuple):
 
 
 @kernel
-def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
-    """The priors with another one of the linear velocities."""
+def at_scale(priors: Priors, log_scale: float, centre: float, freedom: float) -> Priors:
+    """The priors with another ``log b``, its prior mean, and g."""
+    before = priors.velocity
     return Priors(
         priors.gravity1,
         priors.gravity2,
@@ -145,18 +151,14 @@ def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
         priors.rate_weight,
         priors.rotation,
         priors.rotation_information,
-        velocity,
-    )
-
-
-@small_kernel
-def at_scale(priors: Priors, log_scale: float, centre: float, freedom: float) -> Priors:
-    """The priors with another ``log b``, its prior mean, and g."""
-    prior = priors.velocity
-    return with_velocity(
-        priors,
         VelocityPrior(
-            prior.rate, prior.offset, prior.information, log_scale, centre, prior.weight, freedom
+            before.rate,
+            before.offset,
+            before.information,
+            log_scale,
+            centre,
+            before.weight,
+            freedom,
         ),
     )
 
@@ -173,6 +175,13 @@ def unknowns(priors: Priors) -> int:
     return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
 
 
+# Unknowns by which the directions of gravity change. [derived: `_add_gravity`]
+_OF_GRAVITY = np.array([*range(THETA, TANGENT), *range(DW1, PARAMETERS)])
+# Unknowns besides d_1 and d_2 by which the difference u of the velocities changes.
+# [derived: `add_velocities`]
+_OF_VELOCITIES = np.array([*range(TANGENT, D1), SCALE])
+
+
 @small_kernel
 def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
     """``r = g x k`` of the two directions in frame 1."""
@@ -182,25 +191,27 @@ def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: 
     k = exp_so3(tau * state.dw2) @ (state.R @ priors.gravity2)
     aligned = dot(g, k)
     # dr = ((g.k) I - k g^T) (dtheta + tau ddw_2) + tau (g k^T - (g.k) I) ddw_1
-    blocks = (THETA, DW1, DW2)
-    jac = np.zeros((3, 9))
+    jac = np.zeros((9, 3))
     for i in range(3):
         for j in range(3):
             same = aligned if i == j else 0.0
-            jac[i, j] = same - k[i] * g[j]
-            jac[i, 3 + j] = tau * (g[i] * k[j] - same)
-            jac[i, 6 + j] = tau * jac[i, j]
+            by_theta = same - k[i] * g[j]
+            jac[j, i] = by_theta
+            jac[3 + j, i] = tau * (g[i] * k[j] - same)
+            jac[6 + j, i] = tau * by_theta
     r = cross(g, k)
     # Both directions have errors: twice the variance of one.
     w = 0.5 * priors.gravity_weight
     for a in range(9):
-        row = blocks[a // 3] + a % 3
+        by_a = jac[a]
+        row = _OF_GRAVITY[a]
         for i in range(3):
-            gradient[row] += w * jac[i, a] * r[i]
+            gradient[row] += w * by_a[i] * r[i]
         for b in range(9):
-            column = blocks[b // 3] + b % 3
+            by_b = jac[b]
+            column = _OF_GRAVITY[b]
             for i in range(3):
-                hessian[row, column] += w * jac[i, a] * jac[i, b]
+                hessian[row, column] += w * by_a[i] * by_b[i]
     return w * dot(r, r)
 
 
@@ -209,33 +220,44 @@ def add_velocities(
     state: TwoViewState, prior: VelocityPrior, hessian: Array, gradient: Array
 ) -> float:
     """``u^T W u`` of both velocities; t moves in its tangent plane."""
-    b, c, W = math.exp(prior.log_scale), prior.rate, prior.information
+    b = math.exp(prior.log_scale)
+    c = prior.rate
+    W = prior.information
     basis = tangent_basis(state.t)
+    d = np.concatenate((state.d1, state.d2))
     # du by the tangent's two steps and by log b; by (d_1, d_2) it is b.
-    jac, u = np.empty((6, 3)), np.empty(6)
+    jac = np.empty((6, 3))
+    u = np.empty(6)
     for i in range(6):
         axis = i % 3
-        d = state.d1[axis] if i < 3 else state.d2[axis]
-        jac[i, 0], jac[i, 1] = -b * c * basis[axis, 0], -b * c * basis[axis, 1]
-        jac[i, 2] = b * (d - c * state.t[axis])
-        u[i] = jac[i, 2] + prior.offset[i]
-    columns, cost = 3 if len(gradient) > SCALE else 2, 0.0
+        by_scale = b * (d[i] - c * state.t[axis])
+        jac[i, 0] = -b * c * basis[axis, 0]
+        jac[i, 1] = -b * c * basis[axis, 1]
+        jac[i, 2] = by_scale
+        u[i] = by_scale + prior.offset[i]
+    columns = 3 if len(gradient) > SCALE else 2
+    cost = 0.0
     for i in range(6):
-        product, weighted = 0.0, np.zeros(3)
+        velocity = D1 + i
+        of_velocity = hessian[velocity]
+        product = 0.0
+        weighted = np.zeros(3)
         for k in range(6):
-            product += W[i, k] * u[k]
-            hessian[D1 + i, D1 + k] += b * b * W[i, k]
+            weight = W[i, k]
+            product += weight * u[k]
+            of_velocity[D1 + k] += b * b * weight
             for a in range(columns):
-                weighted[a] += W[i, k] * jac[k, a]
+                weighted[a] += weight * jac[k, a]
         cost += u[i] * product
-        gradient[D1 + i] += b * product
+        gradient[velocity] += b * product
         for a in range(columns):
-            row = TANGENT + a if a < 2 else SCALE
-            gradient[row] += jac[i, a] * product
-            hessian[row, D1 + i] += b * weighted[a]
-            hessian[D1 + i, row] += b * weighted[a]
+            row = _OF_VELOCITIES[a]
+            by_row = jac[i, a]
+            gradient[row] += by_row * product
+            hessian[row, velocity] += b * weighted[a]
+            of_velocity[row] += b * weighted[a]
             for e in range(columns):
-                hessian[row, TANGENT + e if e < 2 else SCALE] += jac[i, a] * weighted[e]
+                hessian[row, _OF_VELOCITIES[e]] += by_row * weighted[e]
     return cost
 
 
@@ -248,11 +270,12 @@ def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Ar
     # theta^T Lambda theta: the Jacobian of Log is approximated by I.
     theta = log_so3(state.R @ priors.rotation.T)
     for i in range(3):
-        product = dot(priors.rotation_information[i], theta)
+        information = priors.rotation_information[i]
+        product = dot(information, theta)
         cost += theta[i] * product
         gradient[THETA + i] += product
         for j in range(3):
-            hessian[THETA + i, THETA + j] += priors.rotation_information[i, j]
+            hessian[THETA + i, THETA + j] += information[j]
     prior = priors.velocity
     cost += add_velocities(state, prior, hessian, gradient)
     if len(gradient) > SCALE:
@@ -262,12 +285,15 @@ def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Ar
         hessian[SCALE, SCALE] += prior.weight + prior.freedom
         gradient[SCALE] += prior.weight * away - prior.freedom
         cost = cost + prior.weight * away * away - 2.0 * prior.freedom * prior.log_scale
+    weight = priors.rate_weight
     for i in range(3):
-        hessian[DW1 + i, DW1 + i] += priors.rate_weight
-        hessian[DW2 + i, DW2 + i] += priors.rate_weight
-        gradient[DW1 + i] += priors.rate_weight * state.dw1[i]
-        gradient[DW2 + i] += priors.rate_weight * state.dw2[i]
-        cost += priors.rate_weight * (state.dw1[i] ** 2 + state.dw2[i] ** 2)
+        dw1 = state.dw1[i]
+        dw2 = state.dw2[i]
+        hessian[DW1 + i, DW1 + i] += weight
+        hessian[DW2 + i, DW2 + i] += weight
+        gradient[DW1 + i] += weight * dw1
+        gradient[DW2 + i] += weight * dw2
+        cost += weight * (dw1**2 + dw2**2)
     return cost
 
 

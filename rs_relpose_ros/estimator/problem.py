@@ -8,13 +8,18 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.core.least_squares import slices
+from rs_relpose_ros.estimator.sampson import OBSERVATION, TIMES, VIEW_1, VIEW_2
+from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.so3 import add, cross, rotated, skew
 from rs_relpose_ros.jit import kernel
+
+# Depth of a unit ray below which it has no point at z = 1. [chosen: any value in 1e-9..1e-3 keeps
+# the quotients finite]
+_NEAREST = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +28,11 @@ class TwoViewProblem:
 
     observations: Array  # (N, 20) rows of `sampson`; zero if a match cannot be unprojected
     points: Array  # (6, N) columns of `sampling.multi_scale_cost`
-    valid: NDArray[np.bool_]  # (N,) matches with finite rays
+    valid: Flags  # (N,) matches with finite rays
     focal: float  # [px] mean focal length: pixels per radian at the image centre
     motion1: FrameMotion
     motion2: FrameMotion
-    # [s] of the user's reference row, at which gravity was measured, from the middle row
+    # Time of the reference row, at which gravity was measured, after the middle row [s]
     reference_row_time: float
     rotation: Array | None  # (3, 3) R_1^T R_2 by the gyro
     rotation_information: Array | None  # (3, 3) inverse covariance of its error in frame 1
@@ -53,7 +58,8 @@ def build_problem(
     Without `by_gyro` (models without angular velocity: linear, global) rays are as measured.
     """
     delay = middle_row_delay(camera)
-    motion1, motion2 = motion1.shifted(delay), motion2.shifted(delay)
+    motion1 = motion1.shifted(delay)
+    motion2 = motion2.shifted(delay)
     rotation = information = None
     if relative_rotation is not None and relative_rotation_covariance is not None:
         # R' = Exp(w_1 D)^T R Exp(w_2 D); after the shift, the old reference row lies at -D.
@@ -64,23 +70,22 @@ def build_problem(
         # A floor far below any gyro keeps the information finite.
         information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
         information = 0.5 * (information + information.T)
-    observations = np.empty((len(points1), 20))
-    for k, (pixels, motion) in enumerate(((points1, motion1), (points2, motion2))):
+    still = FrameMotion(np.zeros(3))
+    rotating = (motion1, motion2) if by_gyro else (still, still)
+    observations = np.empty((len(points1), OBSERVATION))
+    for image, pixels in enumerate((points1, points2)):
+        motion = rotating[image]
         rays, jacobian = camera.unproject_with_jacobian(pixels)
         tau = camera.row_times(pixels[:, 1]) - delay
-        rotations, rate = (
-            (motion.rotations(tau), motion.angular_velocity)
-            if by_gyro
-            else (np.tile(np.eye(3), (len(tau), 1, 1)), np.zeros(3))
-        )
-        derotate(
-            rays, jacobian, rotations, camera.line_delay * rate, observations[:, 9 * k : 9 * k + 9]
-        )
-        observations[:, 18 + k] = tau
-    valid, points = _checked_columns(observations)
+        turn_per_row = camera.line_delay * motion.angular_velocity
+        view = observations[:, VIEW_2 * image : VIEW_2 * (image + 1)]
+        derotate(rays, jacobian, motion.rotations(tau), turn_per_row, view)
+        observations[:, TIMES + image] = tau
+    valid = np.asarray(np.isfinite(observations).all(axis=1))
+    observations[~valid] = 0.0
     return TwoViewProblem(
         observations,
-        points,
+        _at_unit_depth(observations),
         valid,
         0.5 * (camera.fx + camera.fy),
         motion1,
@@ -93,40 +98,38 @@ def build_problem(
 
 @kernel
 def derotate(
-    rays: Array, jacobian: Array, rotations: Array, row_rotation: Array, block: Array
+    rays: Array, jacobian: Array, rotations: Array, turn_per_row: Array, view: Array
 ) -> None:
-    """Fill one camera's `block` (N, 9): derotated ray and its derivatives by u and v."""
+    """Fill the `view` (N, 9) of one camera: derotated ray and its derivatives by u and v."""
     for i in range(len(rays)):
-        for j in range(3):
-            f = u = v = 0.0
-            for k in range(3):
-                f += rotations[i, j, k] * rays[i, k]
-                u += rotations[i, j, k] * jacobian[i, k, 0]
-                v += rotations[i, j, k] * jacobian[i, k, 1]
-            block[i, j], block[i, 3 + j], block[i, 6 + j] = f, u, v
+        R = rotations[i]
+        ray = rotated(R, rays[i])
+        by_u = rotated(R, jacobian[i, :, 0])
         # One row further down, the camera has rotated for one more line delay.
+        by_v = add(rotated(R, jacobian[i, :, 1]), cross(turn_per_row, ray))
         for j in range(3):
-            k, m = (j + 1) % 3, (j + 2) % 3
-            block[i, 6 + j] += row_rotation[k] * block[i, m] - row_rotation[m] * block[i, k]
+            view[i, j] = ray[j]
+            view[i, 3 + j] = by_u[j]
+            view[i, 6 + j] = by_v[j]
 
 
-@kernel
-def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Which rows are finite (the others become zero), and the points for `sampling`."""
-    n = len(observations)
-    valid, points = np.empty(n, dtype=np.bool_), np.full((6, n), np.nan)
-    for i in range(n):
-        o = observations[i]
-        valid[i] = True
-        for k in range(len(o)):
-            valid[i] &= math.isfinite(o[k])
-        if not valid[i]:
-            o[:] = 0.0
-        elif o[2] > 1e-6 and o[11] > 1e-6:
-            points[0, i], points[1, i] = o[0] / o[2], o[1] / o[2]
-            points[2, i], points[3, i] = o[9] / o[11], o[10] / o[11]
-            points[4, i], points[5, i] = o[18], o[19]
-    return valid, points
+def _at_unit_depth(observations: Array) -> Array:
+    """The points (6, N) of `sampling.multi_scale_cost`; NaN behind one of the cameras."""
+    points = np.full((6, len(observations)), np.nan)
+    depth1 = observations[:, VIEW_1 + 2]
+    depth2 = observations[:, VIEW_2 + 2]
+    in_front = (depth1 > _NEAREST) & (depth2 > _NEAREST)
+    front = observations[in_front].T
+    points[0:2, in_front] = front[VIEW_1 : VIEW_1 + 2] / front[VIEW_1 + 2]
+    points[2:4, in_front] = front[VIEW_2 : VIEW_2 + 2] / front[VIEW_2 + 2]
+    points[4:6, in_front] = front[TIMES : TIMES + 2]
+    return points
+
+
+# -- The pose between two rows, with its covariance -----------------------------------------------
+
+# Parts of the deviation of a `PairState`, in the order of its covariance. [derived: its fields]
+PARTS = slices(t=3, theta=3, v1=3, v2=3, w1=3, w2=3, log_baseline=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,11 +161,13 @@ def to_reference_row(state: PairState, delay: float, e1: Array, e2: Array) -> Pa
     baseline = state.t - delay * state.v1 + delay * state.R @ state.v2
     scale = float(np.linalg.norm(baseline))
     t = e1.T @ baseline / scale
-    v1, v2 = e1.T @ state.v1 / scale, e2.T @ state.v2 / scale
+    v1 = e1.T @ state.v1 / scale
+    v2 = e2.T @ state.v2 / scale
 
     eye = np.eye(3)
-    jacobian = np.zeros((19, 19))
-    TT, TH, V1, V2, W1, W2 = (slice(3 * k, 3 * k + 3) for k in range(6))
+    size = len(state.covariance)
+    jacobian = np.zeros((size, size))
+    T, THETA, V1, V2, W1, W2, LOG_BASELINE = PARTS.values()
     # t_true = t + dt, R_true = Exp(th) R: baseline' = E1^T (dt - D dv1 + D R dv2 - D [R v2]x th
     #   + D [baseline]x dw1), with rate errors as Exp(D dw_i) E_i.
     by = np.hstack(
@@ -176,20 +181,22 @@ def to_reference_row(state: PairState, delay: float, e1: Array, e2: Array) -> Pa
         ]
     )
     by = e1.T @ by / scale
-    jacobian[TT] = (eye - np.outer(t, t)) @ by
-    # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates rotate the rows.
-    jacobian[TH, TH] = e1.T
-    jacobian[TH, W1] = -delay * e1.T
-    jacobian[TH, W2] = delay * e1.T @ state.R
     along = t @ by
-    for block, velocity, e in ((V1, v1, e1), (V2, v2, e2)):
-        jacobian[block, block] = e.T / scale
-        jacobian[block] -= np.outer(velocity, along)
+    jacobian[T] = (eye - np.outer(t, t)) @ by
+    # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates rotate the rows.
+    jacobian[THETA, THETA] = e1.T
+    jacobian[THETA, W1] = -delay * e1.T
+    jacobian[THETA, W2] = delay * e1.T @ state.R
+    jacobian[V1, V1] = e1.T / scale
+    jacobian[V2, V2] = e2.T / scale
+    jacobian[V1] -= np.outer(v1, along)
+    jacobian[V2] -= np.outer(v2, along)
     jacobian[V1, W1] += delay * skew(v1) @ e1.T
     jacobian[V2, W2] += delay * skew(v2) @ e2.T
-    jacobian[W1, W1] = jacobian[W2, W2] = eye
-    jacobian[18] = along
-    jacobian[18, 18] += 1.0
+    jacobian[W1, W1] = eye
+    jacobian[W2, W2] = eye
+    jacobian[LOG_BASELINE] = along
+    jacobian[LOG_BASELINE, LOG_BASELINE] += 1.0
     return PairState(
         R,
         t,

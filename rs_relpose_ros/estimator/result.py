@@ -10,13 +10,11 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rs_relpose_ros.core.losses import Flags
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import rotated, skew
 from rs_relpose_ros.jit import kernel
@@ -146,7 +144,7 @@ class RelativePose:
     velocity_covariance: Array = field(default_factory=_nan(6, 6))
     baseline: float = math.nan
     baseline_log_sigma: float = math.nan
-    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    inliers: Flags = field(default_factory=lambda: np.zeros(0, dtype=bool))
     images: ImageInformation | None = None
     pixels1_gs: Array | None = None
     pixels2_gs: Array | None = None

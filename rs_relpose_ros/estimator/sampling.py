@@ -13,14 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig
-from rs_relpose_ros.core.losses import cauchy_cost, cauchy_weight, robust_scale, truncated_cost
+from rs_relpose_ros.core.losses import (
+    cauchy_cost,
+    cauchy_weight,
+    robust_scale,
+    truncated_cost,
+)
 from rs_relpose_ros.estimator import priors, sampson
-from rs_relpose_ros.estimator.fit import fit_rotation, FitMatches, gauss_newton, transfer_errors
+from rs_relpose_ros.estimator.fit import fit_rotation, gauss_newton, transfer_errors
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState
 from rs_relpose_ros.estimator.problem import TwoViewProblem
-from rs_relpose_ros.estimator.sampson import RayMatches
-from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.jit import kernel, small_kernel
+from rs_relpose_ros.estimator.sampson import FitMatches, VIEW_1, VIEW_2
+from rs_relpose_ros.geometry import Array, Flags, Indices, so3
+from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 from rs_relpose_ros.solvers import common
 from rs_relpose_ros.solvers.api import GYRO_2PT, SOLVERS, UNIFORM
 from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solutions, Solver
@@ -34,10 +39,30 @@ from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solutions, S
 # At 10 m/s during the readout the angular model leaves 20 px at true inliers, so a single narrow
 # threshold would discard good rotations: the cost is the mean of MSAC costs at growing thresholds.
 
-# Multiples of the inlier threshold. The widest still rejects 19 of 20 random matches.
+# Multiples of the inlier threshold. The widest still rejects 19 of 20 random matches; without it,
+# hypotheses of a fast camera would have no inliers. [chosen: above 20 px, which the angular model
+# leaves, at a threshold of 2 px]
 SCALES = np.array([1.0, 4.0, 12.0])
-# Matches that are scored between two comparisons with the limit.
+# Matches that are scored between two comparisons with the limit. More of them score bad hypotheses
+# for longer, fewer compare too often. [chosen: any value in 32..128 would do]
 BLOCK = 64
+
+Seed = NDArray[np.uint64]
+
+
+@inlined_kernel
+def _essential_columns(b, R):  # type: ignore[no-untyped-def]
+    """Columns of ``[b]x R``."""
+    column_1 = so3.cross(b, so3.column(R, 0, 0))
+    column_2 = so3.cross(b, so3.column(R, 0, 1))
+    column_3 = so3.cross(b, so3.column(R, 0, 2))
+    return column_1, column_2, column_3
+
+
+@inlined_kernel
+def _at_times(of_t, of_d1, of_d2, tau1, tau2):  # type: ignore[no-untyped-def]
+    """Column of ``[t - tau_1 d_1 + tau_2 d_2]x R`` from the same column of t, -d_1 and d_2."""
+    return so3.add(so3.add(of_t, so3.scale(tau1, of_d1)), so3.scale(tau2, of_d2))
 
 
 @small_kernel
@@ -51,40 +76,33 @@ def multi_scale_cost(
     squared thresholds, ascending, in units of the z = 1 plane. A sum above `limit` counts as
     infinite, and the rest of the matches is not scored.
     """
-    # Essential matrices of t, -d_1 and d_2: that of a match is E_0 + tau_1 E_1 + tau_2 E_2.
-    E = np.empty((3, 3, 3))
-    for k in range(3):
-        sign = -1.0 if k == 1 else 1.0
-        bx, by, bz = sign * x[3 * k], sign * x[3 * k + 1], sign * x[3 * k + 2]
-        for j in range(3):
-            E[k, 0, j] = by * R[2, j] - bz * R[1, j]
-            E[k, 1, j] = bz * R[0, j] - bx * R[2, j]
-            E[k, 2, j] = bx * R[1, j] - by * R[0, j]
-    narrow, middle, wide = 1.0 / threshold2[0], 1.0 / threshold2[1], 1.0 / threshold2[2]
+    t1, t2, t3 = _essential_columns((x[0], x[1], x[2]), R)
+    u1, u2, u3 = _essential_columns((-x[3], -x[4], -x[5]), R)
+    v1, v2, v3 = _essential_columns((x[6], x[7], x[8]), R)
+    narrow = 1.0 / threshold2[0]
+    middle = 1.0 / threshold2[1]
+    wide = 1.0 / threshold2[2]
     n = points.shape[1]
-    cost, inliers = 0.0, 0
+    cost = 0.0
+    inliers = 0
     for first in range(0, n, BLOCK):
         for i in range(first, min(first + BLOCK, n)):
-            x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
-            tau1, tau2 = points[4, i], points[5, i]
-            e00 = E[0, 0, 0] + tau1 * E[1, 0, 0] + tau2 * E[2, 0, 0]
-            e01 = E[0, 0, 1] + tau1 * E[1, 0, 1] + tau2 * E[2, 0, 1]
-            e02 = E[0, 0, 2] + tau1 * E[1, 0, 2] + tau2 * E[2, 0, 2]
-            e10 = E[0, 1, 0] + tau1 * E[1, 1, 0] + tau2 * E[2, 1, 0]
-            e11 = E[0, 1, 1] + tau1 * E[1, 1, 1] + tau2 * E[2, 1, 1]
-            e12 = E[0, 1, 2] + tau1 * E[1, 1, 2] + tau2 * E[2, 1, 2]
-            e20 = E[0, 2, 0] + tau1 * E[1, 2, 0] + tau2 * E[2, 2, 0]
-            e21 = E[0, 2, 1] + tau1 * E[1, 2, 1] + tau2 * E[2, 2, 1]
-            e22 = E[0, 2, 2] + tau1 * E[1, 2, 2] + tau2 * E[2, 2, 2]
-            # f_1^T [b]x R f_2: the constraint up to sign
-            gx = e00 * x2 + e01 * y2 + e02
-            gy = e10 * x2 + e11 * y2 + e12
-            gz = e20 * x2 + e21 * y2 + e22
-            kx = e00 * x1 + e10 * y1 + e20
-            ky = e01 * x1 + e11 * y1 + e21
-            value = x1 * gx + y1 * gy + gz
-            r2 = value * value / (gx * gx + gy * gy + kx * kx + ky * ky + 1e-30)
-            # False for NaN, which counts as an outlier.
+            f1 = (points[0, i], points[1, i], 1.0)
+            x2 = points[2, i]
+            y2 = points[3, i]
+            tau1 = points[4, i]
+            tau2 = points[5, i]
+            e1 = _at_times(t1, u1, v1, tau1, tau2)
+            e2 = _at_times(t2, u2, v2, tau1, tau2)
+            e3 = _at_times(t3, u3, v3, tau1, tau2)
+            # The constraint ``f_1^T E f_2`` up to sign, and its derivatives by both points.
+            line = so3.add(so3.add(so3.scale(x2, e1), so3.scale(y2, e2)), e3)
+            value = so3.dot(f1, line)
+            by_x2 = so3.dot(e1, f1)
+            by_y2 = so3.dot(e2, f1)
+            slope2 = line[0] * line[0] + line[1] * line[1] + by_x2 * by_x2 + by_y2 * by_y2
+            r2 = value * value / (slope2 + 1e-30)
+            # Each comparison is false for NaN, which counts as an outlier.
             cost += truncated_cost(r2 * narrow, 1.0)
             cost += truncated_cost(r2 * middle, 1.0)
             cost += truncated_cost(r2 * wide, 1.0)
@@ -98,22 +116,24 @@ class Sampling(NamedTuple):
     """What is sampled, how hypotheses are ranked (`multi_scale_cost`), and when sampling stops."""
 
     points: Array  # (6, N)
-    order: NDArray[np.int64]  # (M,) usable matches, best first
+    order: Indices  # (M,) usable matches, best first
     threshold2: Array  # (3,)
     confidence: float  # probability of a sample without outliers
     max_samples: int
+    seed: Seed  # (1,) state of the random number generator, updated in place
 
 
 class Pool(NamedTuple):
-    """The best distinct hypotheses so far: R (K, 3, 3), x (K, 9), cost (K,), infinite if none."""
+    """The best distinct hypotheses so far, in any order."""
 
-    R: Array
-    x: Array
-    cost: Array
+    R: Array  # (K, 3, 3)
+    x: Array  # (K, 9)
+    cost: Array  # (K,) infinite for a free place
+    inliers: Indices  # (K,) of the middle scale
 
 
 @small_kernel
-def _random(state: NDArray[np.uint64]) -> np.uint64:
+def _random(state: Seed) -> np.uint64:
     """Next number of splitmix64 (Steele et al., OOPSLA 2014): the state is one word."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     z = state[0]
@@ -123,13 +143,11 @@ def _random(state: NDArray[np.uint64]) -> np.uint64:
 
 
 @kernel
-def draw(
-    order: NDArray[np.int64], head: int, sample: NDArray[np.int64], state: NDArray[np.uint64]
-) -> None:
+def draw(order: Indices, head: int, sample: Indices, seed: Seed) -> None:
     """Fill `sample` with distinct entries of ``order[:head]``."""
-    for k in range(sample.shape[0]):
+    for k in range(len(sample)):
         while True:
-            candidate = order[np.int64(_random(state) % np.uint64(head))]
+            candidate = order[np.int64(_random(seed) % np.uint64(head))]
             repeated = False
             for j in range(k):
                 if sample[j] == candidate:
@@ -143,20 +161,22 @@ def draw(
 def _write_ray(x: float, y: float, ray: Array) -> None:
     """Write the unit ray of a point (x, y) at z = 1."""
     inverse_length = 1.0 / math.sqrt(1.0 + x * x + y * y)
-    ray[0], ray[1], ray[2] = x * inverse_length, y * inverse_length, inverse_length
+    ray[0] = x * inverse_length
+    ray[1] = y * inverse_length
+    ray[2] = inverse_length
 
 
 @small_kernel
-def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
+def _write_sample(points: Array, chosen: Indices, sample: Sample) -> bool:
     """Write unit rays and row times of the chosen matches; False if one is not usable."""
-    for k in range(chosen.shape[0]):
-        i = chosen[k]
-        x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
-        if math.isnan(x1):
+    for k in range(len(chosen)):
+        point = points[:, chosen[k]]
+        if math.isnan(point[0]):
             return False
-        _write_ray(x1, y1, sample.f1[k])
-        _write_ray(x2, y2, sample.f2[k])
-        sample.tau1[k], sample.tau2[k] = points[4, i], points[5, i]
+        _write_ray(point[0], point[1], sample.f1[k])
+        _write_ray(point[2], point[3], sample.f2[k])
+        sample.tau1[k] = point[4]
+        sample.tau2[k] = point[5]
     return True
 
 
@@ -167,25 +187,33 @@ def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
     for i in range(3):
         for j in range(3):
             trace += Ra[i, j] * Rb[i, j]
-    if trace < 3.0 - 0.01 * 0.01:
+    if trace < 3.0 - 0.01 * 0.01:  # 1 + 2 cos of the angle between them
         return False
     return abs(so3.dot(xa, xb)) > 1.0 - 0.5 * 0.1 * 0.1
 
 
 @small_kernel
-def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
-    """Replace an equal hypothesis of the pool, or the worst one, by this one if it is better."""
-    place = -1
-    for k in range(pool.cost.shape[0]):
+def _offer(R: Array, x: Array, sampling: Sampling, pool: Pool) -> bool:
+    """Score a hypothesis, and let it replace an equal one of the pool, or the worst, if better.
+
+    Returns whether the pool has changed.
+    """
+    limit = pool.cost.max()
+    cost, inliers = multi_scale_cost(sampling.points, R, x, sampling.threshold2, limit)
+    if not cost < limit:
+        return False
+    place = int(np.argmax(pool.cost))
+    for k in range(len(pool.cost)):
         if pool.cost[k] < math.inf and _same(R, x, pool.R[k], pool.x[k]):
             place = k
             break
-    if place < 0:
-        place = int(np.argmax(pool.cost))
-    if cost < pool.cost[place]:
-        so3.copy_matrix(R, pool.R[place])
-        so3.copy_vector(x, pool.x[place])
-        pool.cost[place] = cost
+    if not cost < pool.cost[place]:
+        return False
+    so3.copy_matrix(R, pool.R[place])
+    so3.copy_vector(x, pool.x[place])
+    pool.cost[place] = cost
+    pool.inliers[place] = inliers
+    return True
 
 
 @kernel
@@ -196,56 +224,48 @@ def sample_hypotheses(
     known: Knowledge,
     drawn: int,
     block: int,
-    best_inliers: int,
     out: Solutions,
     pool: Pool,
-    seed: NDArray[np.uint64],
-) -> tuple[int, int]:
+) -> int:
     """Draw samples for one solver and fill the pool, in place.
 
     `solver`, `size`: address of its kernel, and matches of a sample. `drawn`, `block`: samples
-    drawn by earlier calls, and most samples of this one. `best_inliers`: of the best hypothesis of
-    the pool. `out`: room for the solutions of one sample. Returns the samples drawn so far, and
-    the inliers (middle scale) of the best hypothesis.
+    drawn by earlier calls, and most samples of this one. `out`: room for the solutions of one
+    sample. Returns the samples drawn so far.
     """
-    usable = sampling.order.shape[0]
+    usable = len(sampling.order)
     if usable < size:
-        return drawn, best_inliers
+        return drawn
     chosen = np.empty(size, dtype=np.int64)
     sample = Sample(np.empty((size, 3)), np.empty((size, 3)), np.empty(size), np.empty(size))
-    needed = float(sampling.max_samples)
     last = min(drawn + block, sampling.max_samples)
     # Minimal sets are noisy: an outlier-free one is not yet an accurate one.
     least = min(40, sampling.max_samples)
-    best = pool.cost.min()
-    if best < math.inf:
-        needed = samples_needed(best_inliers / usable, size, sampling)
+    needed = samples_needed(pool, size, sampling)
     while drawn < last and (drawn < least or drawn < needed):
         # The set grows to all matches over 100 samples.
         head = min(usable, max(2 * size, (usable * (drawn + 1)) // 100))
-        draw(sampling.order, head, chosen, seed)
+        draw(sampling.order, head, chosen, sampling.seed)
         drawn += 1
         if not _write_sample(sampling.points, chosen, sample):
             continue
         out.x[:] = 0.0
-        count = common.solve_at(solver, sample, known, out)
-        for k in range(count):
-            limit = pool.cost.max()
-            cost, inliers = multi_scale_cost(
-                sampling.points, out.R[k], out.x[k], sampling.threshold2, limit
-            )
-            if cost < limit:
-                _offer(out.R[k], out.x[k], cost, pool)
-                if cost < best:
-                    best = cost
-                    best_inliers = inliers
-                    needed = samples_needed(inliers / usable, size, sampling)
-    return drawn, best_inliers
+        for k in range(common.solve_at(solver, sample, known, out)):
+            if _offer(out.R[k], out.x[k], sampling, pool):
+                needed = samples_needed(pool, size, sampling)
+    return drawn
 
 
-@small_kernel
-def samples_needed(ratio: float, size: int, sampling: Sampling) -> float:
-    """Samples after which one is free of outliers with probability `sampling.confidence`."""
+@kernel
+def samples_needed(pool: Pool, size: int, sampling: Sampling) -> float:
+    """Samples after which one is free of outliers with probability `sampling.confidence`.
+
+    The share of inliers is that of the best hypothesis so far.
+    """
+    best = int(np.argmin(pool.cost))
+    if not pool.cost[best] < math.inf:
+        return float(sampling.max_samples)
+    ratio = pool.inliers[best] / len(sampling.order)
     good = ratio**size
     if good >= 1.0 - 1e-12:
         return 1.0
@@ -257,12 +277,16 @@ def samples_needed(ratio: float, size: int, sampling: Sampling) -> float:
 
 # -- Solvers of a mode, and the sampling of a frame pair ------------------------------------------
 
-# Hypotheses that are optimised further.
+# Hypotheses that are optimised further. More of them cost time, fewer lose the right one among
+# hypotheses of nearly the same cost. [chosen: the pool is halved from round to round, so that any
+# value in 4..8 costs three or four rounds]
 POOL_SIZE = 6
-# Most samples (20 us each) of a further solver where the gyro's rotation is known: a pair without
-# consensus ends within half an interval of 30 Hz, and repeatably.
+# Most samples (20 us each) of a further solver where the rotation by the gyro is known. A pair
+# without consensus ends within half an interval of 30 Hz, and repeatably. [derived: the times
+# above]
 _MOST_WITHOUT_GYRO = 250
-# With a time limit: samples between two readings of the clock (about 0.2 ms).
+# Samples between two readings of the clock, if there is a time limit. More of them overshoot the
+# limit. [derived: about 0.2 ms]
 _TIMED_BLOCK = 20
 
 
@@ -287,6 +311,7 @@ class SolverMode:
         return 14 if max(solver.sample_size for solver in self.solvers) >= 9 else 6
 
 
+# Modes by the value of the parameter solver.
 MODES = {
     'auto': SolverMode(UNIFORM, (GYRO_2PT, SOLVERS['angular_3pt'], SOLVERS['angular_5pt'])),
     **{name: SolverMode(solver.model, (solver,)) for name, solver in SOLVERS.items()},
@@ -297,8 +322,10 @@ def _knowledge(problem: TwoViewProblem) -> tuple[Knowledge, bool]:
     """What the IMU knows of a pair for its solvers, and whether that includes gravity."""
     known = common.no_knowledge()
     if problem.rotation is not None:
-        known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
-    gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
+        rotation = np.ascontiguousarray(problem.rotation)
+        known = known._replace(rotation=rotation, predicted=True)
+    gravity1 = problem.motion1.gravity
+    gravity2 = problem.motion2.gravity
     if gravity1 is None or gravity2 is None:
         return known, False
     align1 = common.gravity_alignment(gravity1)
@@ -306,25 +333,12 @@ def _knowledge(problem: TwoViewProblem) -> tuple[Knowledge, bool]:
     return known._replace(align1=align1, align2=align2), True
 
 
-def _sampling(
-    problem: TwoViewProblem, config: EstimatorConfig, order: NDArray[np.int64]
-) -> Sampling:
-    """What is sampled of a pair, as configured."""
-    return Sampling(
-        problem.points,
-        order,
-        (config.threshold * SCALES / problem.focal) ** 2,
-        config.confidence,
-        config.max_iterations,
-    )
-
-
 def draw_hypotheses(
     problem: TwoViewProblem,
     mode: SolverMode,
     config: EstimatorConfig,
-    order: NDArray[np.int64],
-    seed: NDArray[np.uint64],
+    order: Indices,
+    seed: Seed,
     enough: float,
     deadline: float,
 ) -> tuple[Solutions, int, bool]:
@@ -336,7 +350,14 @@ def draw_hypotheses(
     were skipped, since one before them had enough inliers.
     """
     known, has_gravity = _knowledge(problem)
-    sampling = _sampling(problem, config, order)
+    sampling = Sampling(
+        problem.points,
+        order,
+        (config.threshold * SCALES / problem.focal) ** 2,
+        config.confidence,
+        config.max_iterations,
+        seed,
+    )
     # All addresses first, so that the first pair compiles the solvers of later pairs, too.
     able = [
         (solver, solver.address)
@@ -344,35 +365,31 @@ def draw_hypotheses(
         if (known.predicted or not solver.needs_rotation)
         and (has_gravity or not solver.needs_gravity)
     ]
-    pool = Pool(np.zeros((POOL_SIZE, 3, 3)), np.zeros((POOL_SIZE, 9)), np.full(POOL_SIZE, np.inf))
+    pool = Pool(
+        np.zeros((POOL_SIZE, 3, 3)),
+        np.zeros((POOL_SIZE, 9)),
+        np.full(POOL_SIZE, np.inf),
+        np.zeros(POOL_SIZE, dtype=np.int64),
+    )
     block = config.max_iterations if math.isinf(deadline) else _TIMED_BLOCK
-    samples = inliers = 0
+    samples = 0
     solvers_skipped = False
     for solver, address in able:
-        solvers_skipped = inliers > enough * len(order) or (
-            samples > 0 and time.perf_counter() >= deadline
-        )
+        inliers = pool.inliers[np.argmin(pool.cost)]
+        too_late = samples > 0 and time.perf_counter() >= deadline
+        solvers_skipped = bool(too_late or inliers > enough * len(order))
         if solvers_skipped:
             break
         out = common.empty_solutions(solver.most_solutions)
         if samples > 0 and known.predicted:
-            sampling = sampling._replace(
-                max_samples=min(config.max_iterations, _MOST_WITHOUT_GYRO)
-            )
-        drawn, new = 0, block
+            most = min(config.max_iterations, _MOST_WITHOUT_GYRO)
+            sampling = sampling._replace(max_samples=most)
+        drawn = 0
+        new = block
         while new == block:
             before = drawn
-            drawn, inliers = sample_hypotheses(
-                address,
-                solver.sample_size,
-                sampling,
-                known,
-                drawn,
-                block,
-                inliers,
-                out,
-                pool,
-                seed,
+            drawn = sample_hypotheses(
+                address, solver.sample_size, sampling, known, drawn, block, out, pool
             )
             new = drawn - before if time.perf_counter() < deadline else 0
         samples += drawn
@@ -382,65 +399,84 @@ def draw_hypotheses(
 
 # -- Local optimisation: inlier selection and fits of the uniform model, shrinking threshold ------
 
-# Multiples of the inlier threshold: the angular model leaves up to 20 px at true inliers.
+# Multiples of the inlier threshold, one a round. Without the first, a hypothesis of the angular
+# model has no inliers at high speed; with fewer steps between, outliers of one round spoil the
+# next. [chosen: the angular model leaves up to 20 px at true inliers]
 SHRINKING = np.array([6.0, 3.0, 1.5, 1.0])
-# Gauss-Newton steps of a hypothesis at each of them.
+# Gauss-Newton steps of a hypothesis in each round. [chosen: the second step makes the error of the
+# first one small, and the inliers change more than the state]
 STEPS = 2
+# Fewest inliers of a hypothesis that is fitted. [derived: one more than the unknowns of a pose]
+_FEWEST_FITTED = 6
 
 
 @kernel
-def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma: float) -> float:
-    """MSAC cost of residuals (N,) in units of sigma."""
+def _truncated_costs(r: Array, weights: Array, bound: float, noise: float) -> float:
+    """MSAC cost of residuals (N,) [px] in units of `noise` [px], truncated at `bound` [px]."""
     cost = 0.0
-    for i in range(r.shape[0]):
-        if valid[i]:
-            cost += truncated_cost(r[i] * r[i], threshold * threshold)
-    return cost / (sigma * sigma)
+    for i in range(len(r)):
+        if weights[i] > 0.0:
+            cost += truncated_cost(r[i] * r[i], bound * bound)
+    return cost / (noise * noise)
+
+
+@kernel
+def _fit_all(
+    matches: FitMatches,
+    prior: Priors,
+    bound: float,
+    noise: float,
+    states: list[TwoViewState],
+    r: list[Array],
+) -> Array:
+    """Fit each state to its inliers within `bound` [px]; states and residuals r change in place.
+
+    `noise` [px] is that of all inliers. Returns the cost of each state, infinite without enough
+    inliers.
+    """
+    costs = np.full(len(states), math.inf)
+    for k in range(len(states)):
+        use = sampson.within(r[k], matches, states[k], bound)
+        if use.sum() < _FEWEST_FITTED:
+            continue
+        of_matches = _truncated_costs(r[k], matches.weights, bound, noise)
+        costs[k] = of_matches + priors.prior_cost(states[k], prior)
+        used = FitMatches(matches.observations, use.astype(np.float64), noise, matches.focal)
+        state = gauss_newton(used, states[k], prior, int(STEPS))
+        errors = sampson.residuals(matches.observations, state)
+        of_matches = _truncated_costs(errors, matches.weights, bound, noise)
+        cost = of_matches + priors.prior_cost(state, prior)
+        if cost < costs[k]:
+            states[k] = state
+            r[k] = errors
+            costs[k] = cost
+    return costs
 
 
 @kernel
 def optimise(
-    matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: float, threshold: float
+    matches: FitMatches, hypotheses: Solutions, prior: Priors, threshold: float
 ) -> tuple[TwoViewState, bool]:
     """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.
 
-    The threshold shrinks from round to round, and each round keeps the better half. `sigma`,
-    `threshold`: noise of a match and inlier threshold [px]. Returns the state, and whether a
-    hypothesis has enough inliers.
+    The inlier threshold shrinks from round to round to `threshold` [px], and each round keeps the
+    better half. Returns the state, and whether a hypothesis has enough inliers.
     """
-    # No test of depths before the sign is known: no parallax is above this noise.
-    unsure = RayMatches(matches.observations, matches.valid, 1e9)
-    states, r = [], []  # that remain, and their residuals
+    # Depths are not tested before the sign of the translation is known.
+    untested = FitMatches(matches.observations, matches.weights, matches.sigma, math.nan)
+    states = []  # of the hypotheses that remain
+    r = []  # their residuals
     for k in range(len(hypotheses.R)):
         state = priors.hypothesis_state(hypotheses.R[k], hypotheses.x[k])
         r.append(sampson.residuals(matches.observations, state))
         # The sign with its matches in front of the cameras; residuals change theirs with it.
-        near = sampson.within(r[k], unsure, state, SHRINKING[0] * threshold)
+        near = sampson.within(r[k], untested, state, SHRINKING[0] * threshold)
         sign = sampson.cheirality_sign(matches.observations, near, state)
         states.append(priors.signed(state, sign))
     for scale in SHRINKING:
-        costs = np.full(len(states), math.inf)
         # Wide selections hold outliers: their residuals are not pixel noise.
-        noise, bound = scale * sigma, scale * threshold
-        for k in range(len(states)):
-            use = sampson.within(r[k], matches, states[k], bound)
-            if use.sum() < 6:
-                continue
-            costs[k] = _truncated_cost(r[k], matches.valid, bound, noise) + priors.prior_cost(
-                states[k], prior
-            )
-            state = gauss_newton(
-                FitMatches(matches.observations, use.astype(np.float64), noise),
-                states[k],
-                prior,
-                int(STEPS),
-            )
-            errors = sampson.residuals(matches.observations, state)
-            cost = _truncated_cost(errors, matches.valid, bound, noise) + priors.prior_cost(
-                state, prior
-            )
-            if cost < costs[k]:
-                states[k], r[k], costs[k] = state, errors, cost
+        noise = scale * matches.sigma
+        costs = _fit_all(matches, prior, scale * threshold, noise, states, r)
         good = (costs < math.inf).sum()
         if good == 0:
             return states[0], False
@@ -448,7 +484,8 @@ def optimise(
         for k in range(len(better)):
             better[k] = int(np.argmin(costs))
             costs[better[k]] = math.inf
-        states, r = [states[k] for k in better], [r[k] for k in better]
+        states = [states[k] for k in better]
+        r = [r[k] for k in better]
     return states[0], True
 
 
@@ -478,25 +515,23 @@ def _unlikelihood(r: Array) -> float:
 
 
 def gain_without_gyro(
-    matches: RayMatches,
-    state: TwoViewState,
-    prior: Priors,
-    focal: float,
+    matches: FitMatches, state: TwoViewState, prior: Priors
 ) -> tuple[float, Array]:
     """Log-likelihood that all matches gain by a free rotation, and that rotation (3, 3).
 
-    Negative if the pose `state`, whose `prior` is the gyro's rotation, is the likelier one.
+    Negative if the pose `state`, whose `prior` has the rotation by the gyro, is the likelier one.
     """
-    observations = np.ascontiguousarray(matches.observations[matches.valid])
+    focal = matches.focal
+    observations = np.ascontiguousarray(matches.observations[matches.weights > 0.0])
     use = np.ones(len(observations), dtype=bool)
     free = prior._replace(rotation_information=np.zeros((3, 3)))
     known = _unlikelihood(sampson.residuals(observations, state))
-    start = so3.aligning_rotation(correlation(observations, use, 0, 9))
+    start = so3.aligning_rotation(correlation(observations, use, VIEW_1, VIEW_2))
     spread = so3.median(transfer_errors(observations, use, start, focal))
     R, _ = fit_rotation(observations, use, start, free, focal, 0.5 * spread)
     t = translation_direction(observations, R)
     velocity = prior.velocity.rate * t
-    state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
+    state = priors.hypothesis_state(R, np.concatenate([t, velocity, velocity]))
     state = priors.signed(state, sampson.cheirality_sign(observations, use, state))
     for k in range(_FREE_ROUNDS + 1):
         r = sampson.residuals(observations, state)
@@ -511,39 +546,42 @@ def gain_without_gyro(
 
 def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
-    turned = (R @ observations[:, 9:12].T).T
-    normals = np.cross(observations[:, :3], turned).T
-    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
-    return np.ascontiguousarray(np.linalg.eigh(normals @ normals.T)[1][:, 0])
+    turned = (R @ observations[:, VIEW_2 : VIEW_2 + 3].T).T
+    normals = np.cross(observations[:, VIEW_1 : VIEW_1 + 3], turned).T
+    lengths = np.sqrt((normals**2).sum(axis=0))
+    normals /= np.maximum(lengths, 1e-3)
+    _, axes = np.linalg.eigh(normals @ normals.T)
+    return np.ascontiguousarray(axes[:, 0])
 
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------
 
 
 @kernel
-def correlation(observations: Array, use: NDArray[np.bool_], first: int, second: int) -> Array:
+def correlation(observations: Array, use: Flags, first: int, second: int) -> Array:
     """``sum a b^T`` (3, 3) over the matches in `use` of two of their vectors, by column."""
     out = np.zeros((3, 3))
-    for i in range(observations.shape[0]):
+    for i in range(len(use)):
         if use[i]:
+            a = observations[i, first:]
+            b = observations[i, second:]
             for j in range(3):
                 for k in range(3):
-                    out[j, k] += observations[i, first + j] * observations[i, second + k]
+                    out[j, k] += a[j] * b[k]
     return out
 
 
-def distinct_directions(
-    observations: Array, use: NDArray[np.bool_], first: int, cell: float
-) -> int:
+def distinct_directions(observations: Array, use: Flags, first: int, cell: float) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
     cells = np.round(observations[use, first : first + 2] / cell)
     return len(set((cells @ [1.0, 1e6]).tolist()))
 
 
-def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:
+def distance_from_a_plane(observations: Array, use: Flags, first: int) -> float:
     """Root mean square distance [rad] of the rays from the best plane through the centre.
 
     Small if the points lie in one place or, in the image, on one line.
     """
     scatter = correlation(observations, use, first, first) / use.sum()
-    return float(np.sqrt(max(np.linalg.eigvalsh(scatter)[0], 0.0)))
+    least = np.linalg.eigvalsh(scatter)[0]
+    return float(np.sqrt(max(least, 0.0)))

@@ -19,7 +19,6 @@ import numpy as np
 
 from rs_relpose_ros.core.epipolar import by_motion, residual, View
 from rs_relpose_ros.core.least_squares import first_indices
-from rs_relpose_ros.core.losses import Flags
 from rs_relpose_ros.core.triangulate import depths
 from rs_relpose_ros.estimator.priors import (
     D1,
@@ -31,7 +30,7 @@ from rs_relpose_ros.estimator.priors import (
     THETA,
     TwoViewState,
 )
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.geometry import Array, Flags, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
 # Matches of a block. Fewer leave a part of the vector registers unused; more do not fit into the
@@ -40,26 +39,33 @@ BLOCK = 64
 # First numbers of an observation: the vectors of both views, and the two row times. A block has
 # the root of the weight behind them.
 _PARTS = first_indices(view_1=9, view_2=9, times=2)
+# First number of the view in image 1. [derived: the order of the parts]
 VIEW_1 = _PARTS['view_1']
+# First number of the view in image 2. [derived: the order of the parts]
 VIEW_2 = _PARTS['view_2']
+# Number of tau_1, which tau_2 follows. [derived: the order of the parts]
 TIMES = _PARTS['times']
+# Count of the numbers. [derived: the sizes of the parts]
 OBSERVATION = _PARTS['end']
+# Row of a block that holds the roots of the weights. [derived: the first row after the numbers]
 ROOT = OBSERVATION
 
 
-class Motion(NamedTuple):
-    """A two-view state, and the rotations of its rays as polynomials in the row times."""
+class FitMatches(NamedTuple):
+    """The matches of a pair as rows of numbers, and how much each of them counts."""
 
-    state: TwoViewState
-    rotation_1: Array  # (3, 3, 3) coefficients of ``Exp(tau_1 dw_1)`` in 1, tau_1, tau_1^2
-    rotation_2: Array  # (3, 3, 3) coefficients of ``Exp(tau_2 dw_2) R`` in 1, tau_2, tau_2^2
+    observations: Array  # (N, 20) rows as above
+    weights: Array  # (N,) 0 to 1; 0 for a match that is not used
+    sigma: float  # noise of a match of weight 1 [px]
+    # Mean focal length [px per radian], which makes the noise an angle where depths are tested.
+    # They are not tested if it is NaN.
+    focal: float = math.nan
 
 
 @inlined_kernel
-def _motion(state: TwoViewState) -> Motion:
-    return Motion(
-        state, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
-    )
+def _rotations(state: TwoViewState) -> tuple[Array, Array]:
+    """Coefficients of ``Exp(tau_1 dw_1)`` and ``Exp(tau_2 dw_2) R`` by `_rotation_series`."""
+    return _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
 
 
 @inlined_kernel
@@ -77,22 +83,20 @@ def _rotation_series(rate: Array, R: Array) -> Array:
     """
     series = np.empty((3, 3, 3))
     so3.copy_matrix(R, series[0])
-    for k in (1, 2):
+    for power in (1, 2):
+        lower = series[power - 1]
         for j in range(3):
-            column = so3.cross(rate, series[k - 1, :, j])
+            column = so3.cross(rate, lower[:, j])
             for i in range(3):
-                series[k, i, j] = column[i] / k
+                series[power, i, j] = column[i] / power
     return series
 
 
 @inlined_kernel
 def _row_at(series, i, tau):  # type: ignore[no-untyped-def]
-    """Row i of the rotation of `_rotation_series` at tau."""
-    return (
-        series[0, i, 0] + tau * (series[1, i, 0] + tau * series[2, i, 0]),
-        series[0, i, 1] + tau * (series[1, i, 1] + tau * series[2, i, 1]),
-        series[0, i, 2] + tau * (series[1, i, 2] + tau * series[2, i, 2]),
-    )
+    """Row i of the rotation of `_rotation_series` at tau, by Horner's scheme."""
+    by_tau = so3.add(series[1, i], so3.scale(tau, series[2, i]))
+    return so3.add(series[0, i], so3.scale(tau, by_tau))
 
 
 @inlined_kernel
@@ -105,20 +109,20 @@ def _times(rows, v):  # type: ignore[no-untyped-def]
 def _view_at(block, i, first, series, tau):  # type: ignore[no-untyped-def]
     """Rotated ray of match i and its derivatives; its values begin in row `first` of the block."""
     rotation = (_row_at(series, 0, tau), _row_at(series, 1, tau), _row_at(series, 2, tau))
-    return View(
-        _times(rotation, so3.column(block, first, i)),
-        _times(rotation, so3.column(block, first + 3, i)),
-        _times(rotation, so3.column(block, first + 6, i)),
-    )
+    ray = so3.column(block, first, i)
+    by_u = so3.column(block, first + 3, i)
+    by_v = so3.column(block, first + 6, i)
+    return View(_times(rotation, ray), _times(rotation, by_u), _times(rotation, by_v))
 
 
 @inlined_kernel
-def _match(block, i, motion):  # type: ignore[no-untyped-def]
+def _match(block, i, state, rotations):  # type: ignore[no-untyped-def]
     """Both views of match i of a block, and the baseline between its rows."""
-    tau1, tau2 = block[TIMES, i], block[TIMES + 1, i]
-    first = _view_at(block, i, VIEW_1, motion.rotation_1, tau1)
-    second = _view_at(block, i, VIEW_2, motion.rotation_2, tau2)
-    return first, second, _baseline(motion.state, tau1, tau2)
+    tau1 = block[TIMES, i]
+    tau2 = block[TIMES + 1, i]
+    first = _view_at(block, i, VIEW_1, rotations[0], tau1)
+    second = _view_at(block, i, VIEW_2, rotations[1], tau2)
+    return first, second, _baseline(state, tau1, tau2)
 
 
 @kernel
@@ -129,7 +133,7 @@ def _gather(observations: Array, weights: Array, first: int, block: Array) -> tu
     there are. The rest of the block is zero, with zero residuals and derivatives.
     """
     count = 0
-    while first < observations.shape[0] and count < BLOCK:
+    while first < len(observations) and count < BLOCK:
         if weights[first] > 0.0:
             for k in range(OBSERVATION):
                 block[k, count] = observations[first, k]
@@ -143,13 +147,15 @@ def _gather(observations: Array, weights: Array, first: int, block: Array) -> tu
 
 
 @inlined_kernel
-def _linearise(block, motion, basis, rows):  # type: ignore[no-untyped-def]
+def _linearise(block, state, rotations, basis, rows):  # type: ignore[no-untyped-def]
     """Derivatives of a block in `rows` (18, BLOCK), residuals last, times the weights' roots."""
     for i in range(BLOCK):
-        first, second, baseline = _match(block, i, motion)
+        first, second, baseline = _match(block, i, state, rotations)
         at = residual(first, second, baseline)
         by_baseline, by_rotation_1, by_rotation_2 = by_motion(first, second, baseline, at)
-        root, tau1, tau2 = block[ROOT, i], block[TIMES, i], block[TIMES + 1, i]
+        root = block[ROOT, i]
+        tau1 = block[TIMES, i]
+        tau2 = block[TIMES + 1, i]
         by_baseline = so3.scale(root, by_baseline)
         by_rotation_1 = so3.scale(root, by_rotation_1)
         by_rotation_2 = so3.scale(root, by_rotation_2)
@@ -166,17 +172,18 @@ def _linearise(block, motion, basis, rows):  # type: ignore[no-untyped-def]
 @kernel
 def residuals(observations: Array, state: TwoViewState) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
-    n = observations.shape[0]
-    motion = _motion(state)
-    block, errors = np.empty((OBSERVATION + 1, BLOCK)), np.empty(BLOCK)
+    n = len(observations)
+    rotations = _rotations(state)
+    block = np.empty((OBSERVATION + 1, BLOCK))
+    errors = np.empty(BLOCK)
     everything = np.ones(n)
     out = np.empty(n)
     first = 0
     while first < n:
         following, count = _gather(observations, everything, first, block)
         for i in range(BLOCK):
-            first_view, second_view, baseline = _match(block, i, motion)
-            errors[i] = residual(first_view, second_view, baseline).value
+            view_1, view_2, baseline = _match(block, i, state, rotations)
+            errors[i] = residual(view_1, view_2, baseline).value
         so3.copy_vector(errors[:count], out[first:])
         first = following
     return out
@@ -185,19 +192,19 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
 @kernel
 def jacobian(observations: Array, state: TwoViewState) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
-    n = observations.shape[0]
-    motion = _motion(state)
+    n = len(observations)
+    rotations = _rotations(state)
     basis = so3.tangent_basis(state.t)
-    block, rows = np.empty((OBSERVATION + 1, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    block = np.empty((OBSERVATION + 1, BLOCK))
+    rows = np.empty((PARAMETERS + 1, BLOCK))
     everything = np.ones(n)
     out = np.empty((n, PARAMETERS))
     first = 0
     while first < n:
         following, count = _gather(observations, everything, first, block)
-        _linearise(block, motion, basis, rows)
+        _linearise(block, state, rotations, basis, rows)
         for i in range(count):
-            for j in range(PARAMETERS):
-                out[first + i, j] = rows[j, i]
+            so3.copy_vector(rows[:PARAMETERS, i], out[first + i])
         first = following
     return out
 
@@ -207,21 +214,23 @@ def normal_equations(
     observations: Array, weights: Array, state: TwoViewState
 ) -> tuple[Array, Array, float]:
     """``J^T W J`` (17, 17), ``J^T W r`` (17,) and ``r^T W r`` with the weights (N,) of matches."""
-    motion = _motion(state)
+    rotations = _rotations(state)
     basis = so3.tangent_basis(state.t)
-    block, rows = np.empty((OBSERVATION + 1, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
-    # The residual as the last column of J: one product contains all three results. By BLAS, with
-    # a fixed order of its sums: a block is too small for threads.
+    block = np.empty((OBSERVATION + 1, BLOCK))
+    rows = np.empty((PARAMETERS + 1, BLOCK))
+    # The residual is the last column of J, so that one product contains all three results. BLAS
+    # adds in a fixed order, because a block is too small for threads.
     gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
     product = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     first = 0
-    while first < observations.shape[0]:
+    while first < len(observations):
         first, _ = _gather(observations, weights, first, block)
-        _linearise(block, motion, basis, rows)
+        _linearise(block, state, rotations, basis, rows)
         np.dot(rows, rows.T, product)
         gram += product
     hessian = gram[:PARAMETERS, :PARAMETERS].copy()
-    return hessian, gram[PARAMETERS, :PARAMETERS].copy(), gram[PARAMETERS, PARAMETERS]
+    gradient = gram[PARAMETERS, :PARAMETERS].copy()
+    return hessian, gradient, gram[PARAMETERS, PARAMETERS]
 
 
 @kernel
@@ -261,14 +270,6 @@ MIN_DEPTH_SPREAD = 0.25
 _FEWEST_DEPTHS = 8
 
 
-class RayMatches(NamedTuple):
-    """All matches of a pair."""
-
-    observations: Array  # (N, 20) rows as above
-    valid: Flags  # (N,) those with finite rays
-    angle_sigma: float  # noise of a ray [rad]
-
-
 @kernel
 def cheirality_sign(observations: Array, use: Flags, state: TwoViewState) -> float:
     """+1 or -1: the sign of (t, d_1, d_2) with more of the matches in front of the cameras.
@@ -276,63 +277,62 @@ def cheirality_sign(observations: Array, use: Flags, state: TwoViewState) -> flo
     Matches are weighted with their parallax: the sign of a depth without parallax is noise.
     """
     vote = 0.0
-    for i in range(observations.shape[0]):
+    for i in range(len(use)):
         if use[i]:
             depth1, depth2, _, _ = triangulated(observations, i, state)
             if not math.isnan(depth1):
-                # Bounded: a match on the baseline has an arbitrarily large inverse depth.
-                vote += max(-1.0, min(1.0, 0.5 / depth1)) + max(-1.0, min(1.0, 0.5 / depth2))
+                # A match on the baseline has an arbitrarily large inverse depth, hence the bounds.
+                vote_1 = max(-1.0, min(1.0, 0.5 / depth1))
+                vote_2 = max(-1.0, min(1.0, 0.5 / depth2))
+                vote += vote_1 + vote_2
     return 1.0 if vote >= 0.0 else -1.0
 
 
 @small_kernel
-def count_behind(matches: RayMatches, use: Flags, state: TwoViewState) -> int:
+def count_behind(matches: FitMatches, use: Flags, state: TwoViewState) -> int:
     """How many of the matches in `use` lie behind a camera, with a significant parallax."""
+    least_parallax = SIGNIFICANT_PARALLAX * (matches.sigma / matches.focal)
     count = 0
     for i in range(len(use)):
         if use[i]:
             depth1, depth2, parallax, _ = triangulated(matches.observations, i, state)
-            significant = parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
-            if significant and min(depth1, depth2) <= 0.0:
+            if parallax >= least_parallax and min(depth1, depth2) <= 0.0:
                 count += 1
     return count
 
 
 @kernel
-def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float) -> Flags:
+def within(r: Array, matches: FitMatches, state: TwoViewState, threshold: float) -> Flags:
     """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths.
 
     A random match within the epipolar band has a small residual, but lies behind a camera or far
-    from the others' depths.
+    from the depths of the others.
     """
     n = len(r)
     use = np.empty(n, dtype=np.bool_)
-    # Depths in units of the distance between the camera's places at the two rows; NaN: untested.
+    # Depths in units of the distance between the places of the camera at the two rows; NaN for a
+    # match whose depth is not tested.
     relative = np.full(n, np.nan)
-    known = np.empty(n)
+    tested = np.empty(n)
     count = 0
+    least_parallax = SIGNIFICANT_PARALLAX * (matches.sigma / matches.focal)
     for i in range(n):
-        use[i] = matches.valid[i] and abs(r[i]) < threshold
+        use[i] = matches.weights[i] > 0.0 and abs(r[i]) < threshold
         if not use[i]:
             continue
         depth1, depth2, parallax, baseline = triangulated(matches.observations, i, state)
-        if not parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma:
+        nearest = min(depth1, depth2)
+        if not parallax >= least_parallax:
             continue
-        if depth1 <= 0.0 or depth2 <= 0.0:
+        if nearest <= 0.0:
             use[i] = False
             continue
-        relative[i] = known[count] = min(depth1, depth2) / baseline
+        relative[i] = nearest / baseline
+        tested[count] = relative[i]
         count += 1
     if count < _FEWEST_DEPTHS:
         return use
-    # Near and far side separately: a scene is denser far away, and its few near points, which
-    # resemble outliers, determine most of the translation.
-    known, last = known[:count], count - 1
-    near = math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last)))
-    centre = math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last)))
-    far = math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last)))
-    lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
-    highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
+    lowest, highest = _plausible_depths(tested[:count])
     for i in range(n):
         if relative[i] < lowest or relative[i] > highest:
             use[i] = False
@@ -340,6 +340,22 @@ def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float)
 
 
 @kernel
-def select_inliers(matches: RayMatches, state: TwoViewState, threshold: float) -> Flags:
+def _plausible_depths(depths: Array) -> tuple[float, float]:
+    """Least and largest plausible depth, from all tested ones (K,), which are reordered.
+
+    The near and the far side have a spread of their own: a scene is denser far away, and its few
+    near points, which resemble outliers, determine most of the translation.
+    """
+    last = len(depths) - 1
+    near = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[0] * last)))
+    centre = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[1] * last)))
+    far = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[2] * last)))
+    nearer = DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD)
+    farther = DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD)
+    return math.exp(centre - nearer), math.exp(centre + farther)
+
+
+@kernel
+def select_inliers(matches: FitMatches, state: TwoViewState, threshold: float) -> Flags:
     """Matches within `threshold` [px] whose depths are plausible."""
     return within(residuals(matches.observations, state), matches, state, threshold)

@@ -14,15 +14,15 @@ import numpy as np
 
 from rs_relpose_ros.config.settings import CarrierMotion, MOTIONS
 from rs_relpose_ros.core.least_squares import eliminate, inverse, log_determinant
-from rs_relpose_ros.core.losses import Flags, noise_mixture
+from rs_relpose_ros.core.losses import noise_mixture
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.covariance import ImageInformation, ROTATION, sandwich, scaled_like
-from rs_relpose_ros.estimator.fit import DataTerm, fit, FitMatches, linearised
+from rs_relpose_ros.estimator.fit import fit, linearised, NormalEquations
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
-from rs_relpose_ros.estimator.sampson import RayMatches
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.estimator.sampson import FitMatches
+from rs_relpose_ros.geometry import Array, Flags, so3
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.jit import kernel, small_kernel
 
@@ -66,10 +66,9 @@ class Refined(NamedTuple):
 class _Search(NamedTuple):
     """What all fits of a pair share."""
 
-    matches: RayMatches
+    matches: FitMatches  # all of them, with the configured noise
     start: TwoViewState
     prior: Priors
-    sigma: float  # configured noise of a match [px]
     threshold: float  # inlier threshold [px]
     scales: Scales
     gyro_error: Array  # (3, 3) of `sandwich`
@@ -86,21 +85,22 @@ class _Optima(NamedTuple):
 
 @kernel
 def fit_with_evidence(
-    matches: RayMatches,
+    matches: FitMatches,
     start: TwoViewState,
     prior: Priors,
-    sigma: float,
     threshold: float,
     scales: Scales,
     gyro_error: Array,
 ) -> Refined:
     """Select inliers and fit repeatedly; average over the scales of the velocities at the end.
 
-    The state is the mean over the scales, weighted by their evidence. `sigma`, `threshold`:
-    configured noise and inlier threshold [px]; `gyro_error` (3, 3) is that of `sandwich`.
+    The state is the mean over the scales, weighted by their evidence. `matches` have the
+    configured noise, `threshold` [px] is the inlier threshold, and `sandwich` describes
+    `gyro_error` (3, 3).
     """
-    search = _Search(matches, start, prior, sigma, threshold, scales, gyro_error)
-    size, n = len(scales.centres), priors.unknowns(prior)
+    search = _Search(matches, start, prior, threshold, scales, gyro_error)
+    size = len(scales.centres)
+    n = priors.unknowns(prior)
     optima = _Optima(
         np.zeros((size, n)),
         np.full(size, -math.inf),
@@ -114,18 +114,21 @@ def fit_with_evidence(
     # The scale of `start`, or the next one.
     best = int(np.argmin(np.abs(scales.centres - prior.velocity.log_scale)))
     for attempt in range(ROUNDS):
-        low, high = 0, size
+        low = 0
+        high = size
         if attempt > 0:  # the best scale changes little with the inliers of the first round
-            low, high = max(best - 1, 0), min(best + 2, size)
+            low = max(best - 1, 0)
+            high = min(best + 2, size)
         _fit_scales(search, used, state, optima, (low, best, high))
-        best = low + int(np.argmax(optima.evidences[low:high]))
+        evidences = optima.evidences
+        best = low + int(np.argmax(evidences[low:high]))
         for k in range(low, high):
-            lacking[k] = optima.evidences[best] - optima.evidences[k]
+            lacking[k] = evidences[best] - evidences[k]
         state = priors.moved(start, optima.steps[best])
-        chosen_from = used.weights > 0.0
+        inliers = used.weights > 0.0
         reach = min(max(threshold, REACH * used.sigma), WIDEST * threshold)
         used = _selected(search, state, reach)
-        if ((used.weights > 0.0) == chosen_from).all():
+        if ((used.weights > 0.0) == inliers).all():
             break
     likely = lacking < LEAST_EVIDENCE
     _fit_again(search, used, optima, likely)
@@ -147,15 +150,18 @@ def _fit_scales(
     """
     low, best, high = scales
     data = linearised(used, state)
-    upwards, upwards_data = state, data
+    upwards = state
+    upwards_data = data
     for number in range(high - low):
         k = best - number if number <= best - low else low + number
         if k == best + 1:
-            state, data = upwards, upwards_data
+            state = upwards
+            data = upwards_data
         centre = search.scales.centres[k]
         state, data = _fit_scale(search, used, state, data, optima, k, centre, int(ITERATIONS))
         if k == best:
-            upwards, upwards_data = state, data
+            upwards = state
+            upwards_data = data
 
 
 @kernel
@@ -167,10 +173,11 @@ def _fit_again(search: _Search, used: FitMatches, optima: _Optima, likely: Flags
     for k in range(len(likely)):
         optima.evidences[k] = -math.inf
         if likely[k]:
-            state = priors.moved(search.start, optima.steps[k])
+            step = optima.steps[k]
+            state = priors.moved(search.start, step)
             log_scale = search.scales.centres[k]
-            if optima.steps.shape[1] > SCALE:
-                log_scale = optima.steps[k, SCALE]
+            if len(step) > SCALE:
+                log_scale = step[SCALE]
             data = linearised(used, state)
             _fit_scale(search, used, state, data, optima, k, log_scale, int(LAST_ITERATIONS))
 
@@ -181,25 +188,24 @@ def _selected(search: _Search, state: TwoViewState, threshold: float) -> FitMatc
     matches = search.matches
     r = sampson.residuals(matches.observations, state)
     inliers = sampson.within(r, matches, state, threshold)
-    weights, sigma = noise_mixture(r, inliers, search.sigma)
-    return FitMatches(matches.observations, weights, sigma)
+    weights, sigma = noise_mixture(r, inliers, matches.sigma)
+    return FitMatches(matches.observations, weights, sigma, matches.focal)
 
 
 @small_kernel
-def _known_velocities(data: DataTerm, state: TwoViewState, prior: Priors) -> float:
+def _known_velocities(data: NormalEquations, state: TwoViewState, prior: Priors) -> float:
     """How many of the six velocities the matches determine rather than their prior.
 
-    ``g = 6 - tr(C V)``, V being the prior's part of the Hessian whose inverse is C (MacKay,
-    Neural Computation 4, 1992): the derivative of the log-evidence by ``log b``.
+    ``g = 6 - tr(C V)``, where V is the part of the prior in the Hessian whose inverse is C
+    (MacKay, Neural Computation 4, 1992): the derivative of the log-evidence by ``log b``.
     """
-    hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    of_prior, ignored = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    hessian = np.zeros((PARAMETERS, PARAMETERS))
+    of_prior = np.zeros((PARAMETERS, PARAMETERS))
+    gradient = np.zeros(PARAMETERS)  # is not used
     priors.add_priors(state, prior, hessian, gradient)
-    priors.add_velocities(state, prior.velocity, of_prior, ignored)
-    for i in range(PARAMETERS):
-        for j in range(PARAMETERS):
-            hessian[i, j] += data.hessian[i, j]
-    return min(max(6.0 - (inverse(hessian) * of_prior).sum(), 0.0), 6.0)
+    priors.add_velocities(state, prior.velocity, of_prior, gradient)
+    known = 6.0 - (inverse(hessian + data.hessian) * of_prior).sum()
+    return min(max(known, 0.0), 6.0)
 
 
 @kernel
@@ -207,33 +213,33 @@ def _fit_scale(
     search: _Search,
     used: FitMatches,
     state: TwoViewState,
-    data: DataTerm,
+    data: NormalEquations,
     optima: _Optima,
     k: int,
     log_scale: float,
     iterations: int,
-) -> tuple[TwoViewState, DataTerm]:
+) -> tuple[TwoViewState, NormalEquations]:
     """Fit about scale k, from `state`, about which `data` is, and `log_scale`; write its optimum.
 
-    Returns the state at the optimum and the data term about it.
+    Returns the state at the optimum and the equations of the matches about it.
     """
     centre = search.scales.centres[k]
     prior = priors.at_scale(search.prior, log_scale, centre, 0.0)
     if prior.velocity.weight > 0.0:
         known = _known_velocities(data, state, prior)
         prior = priors.at_scale(prior, log_scale, centre, known)
-    state, log_scale, data, cost, hessian = fit(used, state, data, prior, iterations)
-    cost += 2.0 * prior.velocity.freedom * log_scale
+    state, log_scale, data, whole = fit(used, state, data, prior, iterations)
+    cost = whole.cost + 2.0 * prior.velocity.freedom * log_scale
     # Velocities that move the camera by more than the baseline within a frame fit any residual,
     # with points behind the cameras: those count as outliers.
     behind = sampson.count_behind(search.matches, used.weights > 0.0, state)
     cost += behind * (search.threshold / used.sigma) ** 2
-    of_width = 6.0 * log_scale - 0.5 * log_determinant(hessian)
+    of_width = 6.0 * log_scale - 0.5 * log_determinant(whole.hessian)
     optima.evidences[k] = -0.5 * cost + of_width + search.scales.log_weights[k]
     so3.copy_vector(priors.step_between(search.start, state), optima.steps[k])
-    if len(hessian) > SCALE:
+    if len(whole.gradient) > SCALE:
         optima.steps[k, SCALE] = log_scale
-    so3.copy_matrix(hessian, optima.hessians[k])
+    so3.copy_matrix(whole.hessian, optima.hessians[k])
     so3.copy_matrix(data.hessian, optima.of_data[k])
     return state, data
 
@@ -246,19 +252,23 @@ def _average(search: _Search, used: FitMatches, optima: _Optima, likely: Flags) 
     """
     size, n = optima.steps.shape
     best = int(np.argmax(optima.evidences))
+    best_step = optima.steps[best]
     # About the best one, from which the local parameters of all of them are small.
-    origin = priors.moved(search.start, optima.steps[best])
+    origin = priors.moved(search.start, best_step)
     weights = np.exp(optima.evidences - optima.evidences[best])
     weights /= weights.sum()
-    mean, away = np.zeros(n), np.zeros((size, n))
+    mean = np.zeros(n)
+    away = np.zeros((size, n))
     for k in range(size):
         if likely[k]:
-            state = priors.moved(search.start, optima.steps[k])
+            step = optima.steps[k]
+            state = priors.moved(search.start, step)
             so3.copy_vector(priors.step_between(origin, state), away[k])
             if n > SCALE:
-                away[k, SCALE] = optima.steps[k, SCALE] - optima.steps[best, SCALE]
+                away[k, SCALE] = step[SCALE] - best_step[SCALE]
             mean += weights[k] * away[k]
-    within_fits, between_fits = np.zeros((n, n)), np.zeros((n, n))
+    within_fits = np.zeros((n, n))
+    between_fits = np.zeros((n, n))
     for k in range(size):
         if likely[k]:
             rest = away[k] - mean
@@ -280,9 +290,10 @@ def _average(search: _Search, used: FitMatches, optima: _Optima, likely: Flags) 
     )
     log_scale = search.scales.centres[best]
     if n > SCALE:
-        log_scale = optima.steps[best, SCALE] + mean[SCALE]
+        log_scale = best_step[SCALE] + mean[SCALE]
     # Root mean square over the six velocities.
-    sigma = math.sqrt(np.trace(inverse(search.prior.velocity.information)) / 6.0)
+    of_velocities = inverse(search.prior.velocity.information)
+    sigma = math.sqrt(np.trace(of_velocities) / 6.0)
     return Refined(
         priors.moved(origin, mean),
         used.weights > 0.0,
@@ -304,22 +315,34 @@ def _average(search: _Search, used: FitMatches, optima: _Optima, likely: Flags) 
 # so that one unknown, b, replaces six. Without accelerometer alpha' and beta' are those of a
 # random acceleration of zero mean and some correlation time.
 
-# Correlation time of a carrier's acceleration [s]: steps, gusts, gears.
+# Correlation time of the acceleration of a carrier [s]. A longer one lets an acceleration move the
+# carrier further, a shorter one less. [chosen: steps, gusts and gears; any value in 0.1..0.5 would
+# do]
 CORRELATION_TIME = 0.2
-# Error of the assumption of a constant velocity during the readout [m/s].
+# Error of the assumption of a constant velocity during the readout [m/s]. A smaller one would make
+# the velocities at both ends of a short interval equal. [chosen: 1 m/s^2 over a third of a readout
+# of 15 ms]
 ROW_VELOCITY_SIGMA = 0.005
-# Scales of the baseline over the speeds of a carrier.
+# Number of scales of the baseline over the speeds of a carrier. More of them cost a fit each, and
+# fewer leave gaps between the optima of neighbours. [chosen: neighbours differ by a factor of 2 to
+# 3]
 SCALE_COUNT = 4
-# Of the prior of each, as a share of the distance to the next one.
+# Sigma of the prior of each scale, as a share of the distance to the next one. With less, scales
+# between two of them are unlikely; with more, all fits have the same prior. [chosen: a long row of
+# such Gaussians is flat to 1e-4, at 0.4 it has ripples of 8 %]
 WIDTH = 0.7
 
-# Without a time between the frames: prior sigmas [baselines per second], and the exponent of the
-# power law of their prior. If the velocities are not observable (sideways motion, cameras at
-# rest), a wide prior would convert noise to velocity and degrees of translation.
+# Prior sigmas of the velocities without a time between the frames [baselines per second]. If the
+# velocities are not observable (sideways motion, cameras at rest), a wide prior alone would
+# convert noise to velocity and degrees of translation. [chosen: from rest to a baseline in a tenth
+# of a second]
 GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+# Exponent of the power law of the prior of these sigmas. A larger one favours cameras at rest.
+# [chosen: the prior is flat at 0, and at 1 it decides against any velocity]
 SMALL_IS_LIKELIER = 0.5
+# Scales without a time between the frames. [derived: the grid and the power law]
 TIMELESS = Scales(np.asarray(-np.log(GRID)), np.asarray(-SMALL_IS_LIKELIER * np.log(GRID)))
-# Velocities fixed at zero.
+# Velocities that are fixed at zero. [derived: the weight of a pinned unknown]
 AT_ZERO = Scales(np.array([0.5 * math.log(priors.PINNED)]), np.zeros(1))
 
 
@@ -333,15 +356,17 @@ def expected_velocities(
     """
     carrier = MOTIONS[motion]
     if inertial is None:
-        expected, covariance = np.zeros(6), _of_carrier(carrier, interval)
+        expected = np.zeros(6)
+        covariance = _of_carrier(carrier, interval)
     else:
         expected, covariance = _of_imu(problem, inertial)
     # (alpha', beta') to u = b (d - c t) + a: a = (alpha' / T, alpha' / T - beta')
     to_velocities = so3.by_axes(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]))
-    covariance = to_velocities @ covariance @ to_velocities.T + ROW_VELOCITY_SIGMA**2 * np.eye(6)
+    covariance = to_velocities @ covariance @ to_velocities.T
+    covariance += ROW_VELOCITY_SIGMA**2 * np.eye(6)
     lowest, highest = span_of_scales(motion, interval)
     step = (highest - lowest) / SCALE_COUNT
-    centres = np.array([lowest + step * (0.5 + k) for k in range(SCALE_COUNT)])
+    centres = np.asarray(lowest + step * (0.5 + np.arange(SCALE_COUNT)), dtype=np.float64)
     prior = VelocityPrior(
         1.0 / interval,
         to_velocities @ expected,
@@ -366,12 +391,15 @@ def _of_imu(problem: TwoViewProblem, inertial: InertialMotion) -> tuple[Array, A
     delay = -problem.reference_row_time
     # From the reference to the middle row.
     turn = problem.motion1.rotations([-delay])[0].T
-    shifted, p = inertial.shifted(delay, turn), np.asarray(inertial.lever_arm)
-    alpha, beta = shifted.alpha, shifted.beta
+    shifted = inertial.shifted(delay, turn)
+    p = np.asarray(inertial.lever_arm)
+    alpha = shifted.alpha
+    beta = shifted.beta
     if p.any():
         if problem.rotation is None:
             raise InputError('inertial with a lever_arm requires relative_rotation, too')
-        R, arm1 = problem.rotation, so3.skew(problem.motion1.angular_velocity) @ p
+        R = problem.rotation
+        arm1 = so3.skew(problem.motion1.angular_velocity) @ p
         arm2 = so3.skew(problem.motion2.angular_velocity) @ p
         alpha = alpha + inertial.duration * arm1 + p - R @ p
         beta = beta + arm1 - R @ arm2
@@ -402,7 +430,8 @@ def _of_carrier(carrier: CarrierMotion, interval: float) -> Array:
 # carrier is a Bayes factor (Kass and Raftery, JASA 1995): above 1 if the images are consistent
 # with the measured one, 1 if they contain no information, below 1 if they contradict it.
 
-# Baselines over which the evidence is averaged.
+# Number of baselines over which the evidence is averaged. Fewer leave gaps, more cost time.
+# [chosen: they differ by a factor of 1.3 for the range of a hand-held camera]
 _BASELINES = 14
 
 
@@ -434,10 +463,11 @@ def inertial_evidence(
         return None
     H, g = _without_rotation(images, problem.rotation, problem.rotation_information)
     unknown, _ = expected_velocities(problem, motion, interval, None)
+    reversed_measured = measured._replace(offset=-measured.offset)
     log_b = np.linspace(*span_of_scales(motion, interval), _BASELINES)
     configured, opposite, nothing = (
         _log_evidence(H, g, images.t, images.velocities, prior, log_b)
-        for prior in (measured, measured._replace(offset=-measured.offset), unknown)
+        for prior in (measured, reversed_measured, unknown)
     )
     if not math.isfinite(configured + opposite - nothing):
         return None
@@ -448,7 +478,8 @@ def _without_rotation(
     images: ImageInformation, rotation: Array, information: Array
 ) -> tuple[Array, Array]:
     """Information (8, 8) and gradient (8,) of s and the velocities, the rotation by the gyro."""
-    H, g = images.information.copy(), images.gradient.copy()
+    H = images.information.copy()
+    g = images.gradient.copy()
     theta = so3.log_so3(np.ascontiguousarray(rotation @ images.R.T))
     H[:ROTATION, :ROTATION] += information
     g[:ROTATION] -= information @ theta
@@ -462,25 +493,29 @@ def _log_evidence(
     H: Array, g: Array, t: Array, velocities: Array, prior: VelocityPrior, log_b: Array
 ) -> float:
     """Log of Z for the acceleration of `prior`, averaged over ``log b`` (K,)."""
-    basis, W = so3.tangent_basis(t), prior.information
-    J, away = np.zeros((6, 8)), np.empty(6)
+    basis = so3.tangent_basis(t)
+    W = prior.information
+    J = np.zeros((6, 8))
+    away = np.empty(6)
     for i in range(6):
-        J[i, 0], J[i, 1] = -prior.rate * basis[i % 3, 0], -prior.rate * basis[i % 3, 1]
+        axis = i % 3
+        J[i, 0] = -prior.rate * basis[axis, 0]
+        J[i, 1] = -prior.rate * basis[axis, 1]
         J[i, 2 + i] = 1.0
-        away[i] = velocities[i] - prior.rate * t[i % 3]
+        away[i] = velocities[i] - prior.rate * t[axis]
     WJ = W @ J
-    JWJ, of_prior = J.T @ WJ, 0.5 * log_determinant(W)
+    JWJ = J.T @ WJ
+    of_prior = 0.5 * log_determinant(W)
     values = np.empty(len(log_b))
     for k in range(len(log_b)):
         b = math.exp(log_b[k])
         u = b * away + prior.offset
-        A, q = H + b * b * JWJ, g + b * (WJ.T @ u)
-        values[k] = (
-            6.0 * log_b[k]
-            + of_prior
-            - 0.5 * log_determinant(A)
-            + 0.5 * (q * (inverse(A) @ q)).sum()
-            - 0.5 * (u * (W @ u)).sum()
-        )
+        A = H + b * b * JWJ
+        q = g + b * (WJ.T @ u)
+        value = 6.0 * log_b[k] + of_prior
+        value -= 0.5 * log_determinant(A)
+        value += 0.5 * (q * (inverse(A) @ q)).sum()
+        value -= 0.5 * (u * (W @ u)).sum()
+        values[k] = value
     largest = values.max()
     return largest + math.log(np.exp(values - largest).mean())

@@ -39,6 +39,12 @@ def add(a: Vector | Array, b: Vector | Array) -> Vector:
 
 
 @small_kernel
+def subtract(a: Vector | Array, b: Vector | Array) -> Vector:
+    """``a - b``."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@small_kernel
 def scale(factor: float, v: Vector | Array) -> Vector:
     """``factor v``."""
     return (factor * v[0], factor * v[1], factor * v[2])

@@ -207,7 +207,8 @@ class ForceFault(str):
             f'the accelerometer reads {length:.3g} m/s^2 in the mean, not {STANDARD_GRAVITY}{hint}'
         )
         fault = super().__new__(cls, f'{message}: {cls.fix}')
-        fault.length, fault.message = length, message
+        fault.length = length
+        fault.message = message
         return fault
 
     length: float
