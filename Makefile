@@ -57,7 +57,7 @@ lint: $(test_stamp)
 # of three copies of Fast DDS, which are links outside a wheel.
 $(stamp): export PYTHONDONTWRITEBYTECODE :=
 $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py setup.cfg \
-    rs_relpose_lab/pyproject.toml
+    package.xml rs_relpose_lab/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
 	@echo 'Setting up $(VENV): a minute or two and 0.8 GB.'

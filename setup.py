@@ -3,6 +3,7 @@
 import logging
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -11,7 +12,6 @@ from setuptools.command.build_py import build_py
 from setuptools.command.develop import develop
 
 NAME = 'rs_relpose_ros'
-VERSION = '0.1.0'
 # Module -> call in it that compiles the kernels of a node with its default parameters.
 WARM_UPS = {
     'pipeline.warm_up': 'cache_is_filled() or module.fill_cache()',
@@ -19,6 +19,15 @@ WARM_UPS = {
     'pipeline.global_shutter': 'warm_up_unroller(module.Parameters())',
     'odometry.pair': 'warm_up_odometry()',
 }
+
+
+def version() -> str:
+    """Version in package.xml, the only source of it."""
+    manifest = Path('package.xml').read_text(encoding='utf-8')
+    found = re.search(r'<version>([0-9]+\.[0-9]+\.[0-9]+)</version>', manifest)
+    if found is None:
+        sys.exit('package.xml has no <version> of three numbers, such as 0.4.0')
+    return found[1]
 
 
 def files_in(folder: str) -> list[str]:
@@ -33,11 +42,15 @@ def libraries() -> list[str]:
 
 
 def laboratory() -> str:
-    """Requirement of the extra `lab`: the folder in this checkout, which no index offers."""
+    """Requirement of the extra `lab`: the folder in this checkout.
+
+    A distribution for others has no path of the machine that built it: its laboratory is a
+    distribution of the same version.
+    """
     folder = Path(__file__).resolve().with_name('rs_relpose_lab')
-    if (folder / 'pyproject.toml').exists():
+    if 'sdist' not in sys.argv and (folder / 'pyproject.toml').exists():
         return f'rs_relpose_lab @ {folder.as_uri()}'
-    return f'rs_relpose_lab=={VERSION}'
+    return f'rs_relpose_lab=={version()}'
 
 
 def compile_kernels(folder: str) -> None:
@@ -93,10 +106,11 @@ class DevelopWithKernels(develop):
 
 setup(
     name=NAME,
-    version=VERSION,
+    version=version(),
     description='Relative pose of two rolling-shutter images, aided by an IMU',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     maintainer='rs_relpose_ros maintainers',
-    maintainer_email='maintainers@users.noreply.h-seed-7badc013.example',
     license='Apache-2.0',
     python_requires='>=3.11',
     packages=find_packages(include=[NAME, NAME + '.*']),

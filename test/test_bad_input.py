@@ -72,7 +72,7 @@ def check_outcome(pose, count):
         pose.angular_velocity2,
         pose.covariance.ravel(),
         pose.velocity_covariance.ravel(),
-        [pose.residual_rms, pose.velocity_sigma],
+        [pose.diagnostics.residual_rms, pose.diagnostics.velocity_sigma],
     ]
     assert np.isfinite(np.concatenate(values)).all()
     scale = np.abs(pose.covariance).max()

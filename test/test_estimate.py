@@ -17,7 +17,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import fit, priors, sampson, velocity
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import build_problem
-from rs_relpose_ros.estimator.result import landmarks, Status
+from rs_relpose_ros.estimator.result import Diagnostics, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import tangent_basis
 
@@ -456,12 +456,12 @@ def test_a_baseline_is_given_only_if_it_is_known(scenes):
     scene, inertial = scenes[1], scenes[1].arguments['inertial']
     pose = scene.pose(between=(), inertial=None)
     assert pose and np.isnan([pose.baseline, pose.baseline_log_sigma]).all()
-    assert 'no acceleration' in pose.baseline_reason
+    assert 'no acceleration' in pose.diagnostics.baseline_reason
     assert np.isnan(pose.metric_velocity2).all()
     # An accelerometer with any error has no information.
     pose = scene.pose(between=(), inertial=replace(inertial, covariance=1e4 * np.eye(6)))
     assert pose and np.isnan(pose.baseline)
-    assert 'within its own errors' in pose.baseline_reason
+    assert 'within its own errors' in pose.diagnostics.baseline_reason
 
 
 def test_interval_duration_inverse_and_lever_arm_of_a_baseline(scenes):
@@ -518,7 +518,7 @@ def test_images_distinguish_the_acceleration_from_another_one(scenes, with_accel
         configured = scene.arguments['inertial']
         pose = scene.pose(between=(), inertial=configured if with_accelerometer else None)
         if with_accelerometer:
-            assert pose.inertial_evidence == pytest.approx(
+            assert pose.diagnostics.inertial_evidence == pytest.approx(
                 evidence(scene, pose, configured), abs=1e-6
             )
         for found, map_ in ((right, np.eye(3)), (permuted, axes)):
@@ -780,3 +780,13 @@ def test_gravity_holds_at_the_reference_row_for_any_gyro():
         errors.append(rotation_error(pose.R, scene.R))
     # With exact gravity at the middle row these are 0.13 to 3.3 deg.
     assert np.median(errors) < 0.05
+
+
+def test_former_attributes_of_a_pose_work_with_a_warning():
+    """Deprecated in 0.4.0, gone in 0.6.0: docs/releasing.md has the policy."""
+    pose = RelativePose(Status.OK, diagnostics=Diagnostics(model='uniform', frames=5))
+    for name in ('model', 'frames'):
+        with pytest.warns(
+            DeprecationWarning, match=rf'RelativePose\.{name} .*diagnostics\.{name}'
+        ):
+            assert getattr(pose, name) == getattr(pose.diagnostics, name)

@@ -186,7 +186,7 @@ def test_exact_data_give_the_true_pose():
     scene = Scene(1, sigma=1e-4, gyro=1e-3)
     pose = scene.pose()
     error, log_baseline = scene.error(pose)
-    assert pose.frames == len(TIMES) and pose.frames_reason == ''
+    assert pose.diagnostics.frames == len(TIMES) and pose.diagnostics.frames_reason == ''
     # Limits: the acceleration within the readouts is constant in the model, here it has a jerk.
     assert np.abs(error[:3]).max() < 2e-4 and np.abs(error[3:]).max() < 2e-5
     assert abs(log_baseline) < 0.01
@@ -222,18 +222,18 @@ def test_covariance_is_that_of_the_errors():
         scene = Scene(seed)
         pose = scene.pose()
         error, log_baseline = scene.error(pose)
-        assert pose.frames == len(TIMES)
+        assert pose.diagnostics.frames == len(TIMES)
         np.testing.assert_allclose(pose.covariance[:3, :3] @ pose.t, 0.0, atol=1e-12)
         chi2.append(error @ np.linalg.pinv(pose.covariance, rcond=1e-9) @ error / 5.0)
         logs.append(log_baseline / pose.baseline_log_sigma)
-        lengths.append(pose.pixel_sigma)
+        lengths.append(pose.diagnostics.pixel_sigma)
         start = scene.motion.p(1e-5) - scene.motion.p(-1e-5)
         across = np.linalg.svd(pose.linear_velocity1[None])[2][1:]
         off = across @ start / np.linalg.norm(start) * np.linalg.norm(pose.linear_velocity1)
         starts.append(
             off @ np.linalg.solve(across @ pose.linear_velocity1_covariance @ across.T, off) / 2.0
         )
-        by_gyro.append(pose.gyro_square / 3.0)
+        by_gyro.append(pose.diagnostics.gyro_square / 3.0)
     # Mean of 40 chi-squares of 5 degrees of freedom, by freedom: 1 +- 0.1.
     assert 0.7 < np.mean(chi2) < 1.4
     assert np.isfinite(logs).sum() > 30 and 0.5 < np.nanmean(np.square(logs)) < 1.8
@@ -496,7 +496,7 @@ def test_tracks_may_be_missing_and_wrong(scene):
         points[rng.random(len(points)) < 0.33] = np.nan
         between.append(replace(frame, points=points))
     pose, all_tracks = scene.pose(between=between), scene.pose()
-    assert pose.frames == len(TIMES)
+    assert pose.diagnostics.frames == len(TIMES)
     sigma = np.sqrt(np.trace(all_tracks.covariance[:3, :3]))
     assert np.linalg.norm(pose.t - all_tracks.t) < 3.0 * sigma
 
@@ -508,7 +508,7 @@ def test_less_is_enough(scene, solo):
     )
     pose = scene.pose(between=between)
     error, _ = scene.error(pose)
-    assert pose.frames == len(between) + 2
+    assert pose.diagnostics.frames == len(between) + 2
     assert error @ np.linalg.pinv(pose.covariance, rcond=1e-9) @ error / 5.0 < 5.0
 
 

@@ -302,7 +302,7 @@ def values_of(pair: PairResult) -> tuple[Any, ...]:
         pair.reference_stamp_ns,
         pair.stamp_ns,
         pose.status,
-        pose.iterations,
+        pose.diagnostics.iterations,
         pose.R.tobytes(),
         pose.t.tobytes(),
         pose.covariance.tobytes(),

@@ -26,7 +26,6 @@ from rs_relpose_ros.cli import main as command_line
 from rs_relpose_ros.errors import InputError, MissingInputError
 
 NAME = 'rs_relpose_ros'
-VERSION = '0.1.0'
 ROS = re.compile(
     r'(rclpy|rcl_interfaces|ament_\w+|builtin_interfaces|launch\w*|rosgraph_msgs'
     r'|tf2_ros|std_srvs|\w+_msgs)$'
@@ -95,22 +94,47 @@ def module_behind(name: str) -> str:
     return name
 
 
+def from_setup(field: str) -> str:
+    """What setup.py gives for a field of the metadata, one entry a line."""
+    printing = (
+        'import runpy, setuptools\n'
+        'def show(**metadata):\n'
+        f'    value = metadata[{field!r}]\n'
+        '    print(value if isinstance(value, str) else "\\n".join(value))\n'
+        'setuptools.setup = show\n'
+        'runpy.run_path("setup.py")'
+    )
+    ended = run(sys.executable, '-c', printing, cwd=ROOT)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout.strip()
+
+
 def test_versions_agree(capsys):
     manifest = (ROOT / 'package.xml').read_text()
-    assert re.search(r'<version>(.*?)</version>', manifest)[1] == VERSION
-    assert re.search(r"VERSION = '(.*?)'", (ROOT / 'setup.py').read_text())[1] == VERSION
+    version = re.search(r'<version>(.*?)</version>', manifest)[1]
+    assert from_setup('version') == version
     laboratory = tomllib.loads((ROOT / LABORATORY / 'pyproject.toml').read_text())['project']
-    assert laboratory['version'] == VERSION
-    assert laboratory['dependencies'] == [f'{NAME}=={VERSION}']
+    assert laboratory['version'] == version
+    assert laboratory['dependencies'] == [f'{NAME}=={version}']
     releases = re.findall(
-        r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$',
+        r'^(\d+\.\d+\.\d+) \((\d{4}-\d\d-\d\d)\)\n-+$',
         (ROOT / 'CHANGELOG.rst').read_text(),
         re.MULTILINE,
     )
-    assert releases[0] == VERSION
-    assert distribution(NAME).version == VERSION
+    assert releases[0][0] == version
+    numbers = [tuple(map(int, release.split('.'))) for release, _ in releases]
+    days = [day for _, day in releases]
+    assert numbers == sorted(numbers, reverse=True) and days == sorted(days, reverse=True)
+    assert distribution(NAME).version == version
     assert command_line.main(['--version']) == 0
-    assert capsys.readouterr().out == f'rs_relpose {VERSION}\n'
+    assert capsys.readouterr().out == f'rs_relpose {version}\n'
+
+
+def test_the_maintainer_is_at_no_made_up_host():
+    """An address that nobody reads is at .invalid, which never becomes a host (RFC 2606)."""
+    address = re.search(r'<maintainer email="(.*?)"', (ROOT / 'package.xml').read_text())[1]
+    assert address.endswith('.invalid')
+    assert '@' not in from_setup('maintainer')
 
 
 def test_manifest_names_every_ros_package_that_is_imported():
@@ -151,13 +175,8 @@ def test_pip_and_rosdep_install_every_library_that_is_imported():
     lines = (ROOT / 'requirements' / 'base.txt').read_text().lower().splitlines()
     listed = {re.match(r'[\w-]+', line)[0] for line in lines if not line.startswith(('#', 'ros-'))}
     assert set(pip) == listed - {'setuptools'}
-    printing = (
-        'import runpy, setuptools\n'
-        'setuptools.setup = lambda **metadata: print(*metadata["install_requires"], sep="\\n")\n'
-        'runpy.run_path("setup.py")'
-    )
-    ended = run(sys.executable, '-c', printing, cwd=ROOT)
-    assert {re.match(r'[\w-]+', line)[0].lower() for line in ended.stdout.splitlines()} == listed
+    printed_names = from_setup('install_requires').splitlines()
+    assert {re.match(r'[\w-]+', line)[0].lower() for line in printed_names} == listed
     manifest = (ROOT / 'package.xml').read_text()
     keys = set(re.findall(r'<exec_depend>(python3-.*?)</', manifest))
     assert set(rosdep) == keys

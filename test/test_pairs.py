@@ -280,7 +280,7 @@ def test_frames_between_close_ones_are_used(library, returned):
         done |= pairs.process(views[-1], parameters) or {}
     later = [view_frame(frame, imu, parameters, since=views[0]) for frame in frames[1:]]
     pose = estimate_wide_pair(views[0], later[-1], parameters, later[:-1]).pose
-    assert pose.frames == done[ends].pose.frames == 5
+    assert pose.diagnostics.frames == done[ends].pose.diagnostics.frames == 5
     np.testing.assert_allclose(done[ends].pose.t, pose.t, atol=1e-4)
     states = simulation.states([views[k].imu.reference_ns for k in (0, -1)])
     true = states.R_world_cam[0].T @ (states.position[1] - states.position[0])
@@ -291,7 +291,10 @@ def test_frames_between_close_ones_are_used(library, returned):
     # Frames with another gyro or another calibration are left out.
     zoomed = [replace(view, intrinsics=replace(view.intrinsics, fx=500.0)) for view in later[:-1]]
     for others in (views[2:-1], zoomed):
-        assert estimate_wide_pair(views[0], later[-1], parameters, others).pose.frames == 2
+        assert (
+            estimate_wide_pair(views[0], later[-1], parameters, others).pose.diagnostics.frames
+            == 2
+        )
 
 
 def test_images_are_kept_until_the_last_of_their_pairs(library):

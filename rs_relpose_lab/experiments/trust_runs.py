@@ -518,7 +518,7 @@ def _true_pair(recording: Recording, pair: PairResult) -> trust_rows.TruePair | 
         rates[1],
         middles[0],
         middles[1],
-        pair.pose.residual_rms,
+        pair.pose.diagnostics.residual_rms,
         config.gyro_noise_density,
     )
 

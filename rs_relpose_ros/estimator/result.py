@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 import math
-from operator import attrgetter
 from typing import Any, NamedTuple
+import warnings
 
 import numpy as np
 
@@ -85,15 +85,21 @@ class Diagnostics:
 
 
 def _of_diagnostics(name: str) -> Any:
-    """A property of a pose that is an attribute of its diagnostics."""
-    return property(attrgetter(f'diagnostics.{name}'), doc=f'`diagnostics.{name}`.')
+    """A property of a pose that is an attribute of its diagnostics; to read it gives a warning."""
+    text = f'RelativePose.{name} is deprecated and ends with 0.6.0: use .diagnostics.{name}'
+
+    def read(pose: RelativePose) -> Any:
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return getattr(pose.diagnostics, name)
+
+    return property(read, doc=f'Deprecated since 0.4.0: `diagnostics.{name}`.')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
     """Pose of camera 2 in camera 1, ``X1 = R X2 + t`` with ``|t| = 1``; falsy without a pose.
 
-    The attributes of `diagnostics` are also attributes of the pose.
+    The attributes of `diagnostics` are also attributes of the pose, which are deprecated.
 
     Attributes
     ----------
@@ -230,7 +236,7 @@ class RelativePose:
             diagnostics=replace(self.diagnostics, inertial_evidence=None),
         )
 
-    # Attributes of earlier releases, now of `diagnostics`.
+    # Attributes of releases before 0.4.0, now of `diagnostics`; they end with 0.6.0.
     model = _of_diagnostics('model')
     iterations = _of_diagnostics('iterations')
     residual_rms = _of_diagnostics('residual_rms')

@@ -648,8 +648,8 @@ def draw_pair(result: PairResult) -> Color:
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
             _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y))
     pose = result.pose
-    model = f' {pose.model}' if pose else ''
-    residual = f', residual {pose.residual_rms:.2f} px' if pose else ''
+    model = f' {pose.diagnostics.model}' if pose else ''
+    residual = f', residual {pose.diagnostics.residual_rms:.2f} px' if pose else ''
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
     text = (
         f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
