@@ -17,20 +17,24 @@ from rs_relpose_ros.tracking import images
 
 _logger = logging.getLogger(__name__)
 
-# Models of CameraInfo by the names, in lower case, that OpenCV, Kalibr, OpenVINS and drivers
-# write.
+# The model that ROS assumes where a driver names none. [derived: sensor_msgs/CameraInfo]
 _POLYNOMIAL = 'plumb_bob'
+# Models of CameraInfo by the names, in lower case, that OpenCV, Kalibr, OpenVINS and drivers
+# write. [derived: these projects]
 _ALIASES = {
     **dict.fromkeys(('radtan', 'radial-tangential', 'brown', 'brown_conrady'), _POLYNOMIAL),
     **dict.fromkeys(('equi', 'fisheye', 'kannala_brandt', 'kannala_brandt4'), 'equidistant'),
 }
-# Names of a camera without distortion: simulators, and drivers that rectify.
+# Names of a camera without distortion, as simulators and drivers that rectify write them.
+# [derived: these drivers]
 _NONE = ('', 'none', 'pinhole', 'perspective')
-# Sizes of OpenCV's vectors: k1 k2 p1 p2 k3; up to k6; up to the thin prism; and up to the two
-# angles of a tilted sensor. [derived: OpenCV's order of coefficients]
+# Size of OpenCV's vector k1 k2 p1 p2 k3. [derived: OpenCV's order of coefficients]
 _PLUMB_BOB = 5
+# Size of the vector that goes on to k6. [derived: the same]
 _RATIONAL = 8
+# Size of the vector that goes on to the coefficients of a thin prism. [derived: the same]
 _PRISM = 12
+# Size of the vector that goes on to the two angles of a tilted sensor. [derived: the same]
 _TILTED = 14
 # Largest distance of a principal point from the centre, as a share of the image's side, of a
 # matrix that belongs to the image. The contradiction shows if only one of two meanings fulfils
@@ -40,7 +44,7 @@ _OFF_CENTRE = 0.2
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
     """Intrinsics of a CameraInfo, region of interest and binning included; MissingInputError."""
-    k = [float(value) for value in info_field(msg, 'k')]
+    k = _floats(msg, 'k')
     if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
             'the camera is uncalibrated (k[0] of its CameraInfo is 0): calibrate it and let its '
@@ -48,15 +52,17 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
         )
     pinhole = pinhole_of_matrix('k of CameraInfo', k)
     images.check_image_size(int(msg.width), int(msg.height))
-    model, distortion = lens_of(
-        str(msg.distortion_model)[:40], tuple(float(value) for value in info_field(msg, 'd'))
-    )
+    model, distortion = lens_of(str(msg.distortion_model)[:40], tuple(_floats(msg, 'd')))
     return Intrinsics(
         **_part_of_sensor(msg, pinhole['cx'], pinhole['cy']),
         **pinhole,
         distortion_model=model,
         distortion=distortion,
     )
+
+
+def _floats(msg: Any, name: str) -> list[float]:
+    return [float(value) for value in info_field(msg, name)]
 
 
 def info_field(msg: Any, name: str) -> Any:
@@ -117,7 +123,8 @@ def lens_of(model: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[flo
     name = _ALIASES.get(name, name)
     given = len(coefficients)
     # Zeros behind the last coefficient that is not zero change nothing.
-    used = max((k + 1 for k, value in enumerate(coefficients) if value != 0.0), default=0)
+    nonzero = [k for k, value in enumerate(coefficients) if value != 0.0]
+    used = nonzero[-1] + 1 if nonzero else 0
     if name in _NONE:
         if used:
             raise InputError(

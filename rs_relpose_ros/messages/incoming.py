@@ -49,10 +49,8 @@ def stamp_ns(header: Any) -> int:
 
 def time_ns(stamp: Any) -> int:
     """Integer [ns] of a builtin_interfaces/Time."""
-    return _nanoseconds(int(stamp.sec), int(stamp.nanosec))
-
-
-def _nanoseconds(seconds: int, nanoseconds: int) -> int:
+    seconds = int(stamp.sec)
+    nanoseconds = int(stamp.nanosec)
     if nanoseconds >= NANOSECONDS:
         raise InputError(
             f'stamp is out of range: {seconds} s and {nanoseconds} ns, nanosec must be below '
@@ -63,24 +61,24 @@ def _nanoseconds(seconds: int, nanoseconds: int) -> int:
     return seconds * NANOSECONDS + nanoseconds
 
 
-# First characters of a JPEG and of a PNG file as text in base64, as bridges to web pages send it.
+# First characters of a JPEG and of a PNG file as text in base64. Bridges to web pages send files
+# as such a text. [derived: base64 of the first bytes of both formats]
 _BASE64 = (b'/9j/', b'iVBORw0KGgo')
 
 
 def image_from_message(msg: Any) -> images.EncodedImage:
     """Image of a sensor_msgs/Image or CompressedImage; a view, checked when it is decoded."""
     data = np.frombuffer(msg.data, dtype=np.uint8)
-    stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
+    origin = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
-        return images.CompressedImage(_binary(data), str(msg.format), stamp, frame_id)
+        return images.CompressedImage(_binary(data), str(msg.format), *origin)
     encoding = str(msg.encoding)
-    width, height = int(msg.width), int(msg.height)
-    if images.is_encoded(data, (width, height)):
+    size = int(msg.width), int(msg.height)
+    if images.is_encoded(data, size):
         # A driver in MJPEG mode publishes what the camera sends, whatever encoding it names.
-        return images.CompressedImage(data, f'{encoding}; a file in an Image', stamp, frame_id)
-    return images.RawImage(
-        data, encoding, width, height, int(msg.step), bool(msg.is_bigendian), stamp, frame_id
-    )
+        return images.CompressedImage(data, f'{encoding}; a file in an Image', *origin)
+    is_big_endian = bool(msg.is_bigendian)
+    return images.RawImage(data, encoding, *size, int(msg.step), is_big_endian, *origin)
 
 
 def _binary(data: images.Bytes) -> images.Bytes:
@@ -93,9 +91,12 @@ def _binary(data: images.Bytes) -> images.Bytes:
 
 def pose_from_message(msg: Any) -> TruePose:
     """Pose of a geometry_msgs/PoseStamped."""
-    position, q = msg.pose.position, msg.pose.orientation
+    position = msg.pose.position
+    rotation = msg.pose.orientation
     return TruePose(
-        stamp_ns(msg.header), (position.x, position.y, position.z), (q.x, q.y, q.z, q.w)
+        stamp_ns(msg.header),
+        (position.x, position.y, position.z),
+        (rotation.x, rotation.y, rotation.z, rotation.w),
     )
 
 
@@ -106,10 +107,13 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
     with one topic per sensor leave the other vector zero, so an accelerometer that reads exactly
     zero in all axes counts as absent. Without `with_gyro` the topic is that of the accelerometer.
     """
-    stamp, rate, force = stamp_ns(msg.header), msg.angular_velocity, msg.linear_acceleration
-    angular_velocity = linear_acceleration = None
-    if with_gyro and msg.angular_velocity_covariance[0] != -1.0:
+    stamp = stamp_ns(msg.header)
+    force = msg.linear_acceleration
+    angular_velocity = linear_acceleration = down = None
+    if with_gyro and has_gyro(msg):
+        rate = msg.angular_velocity
         angular_velocity = _vector('angular_velocity', rate, MAX_ANGULAR_VELOCITY)
+        down = _down(msg)
     if msg.linear_acceleration_covariance[0] != -1.0 and (force.x or force.y or force.z):
         linear_acceleration = _vector('linear_acceleration', force, MAX_LINEAR_ACCELERATION)
     if angular_velocity is None and linear_acceleration is None:
@@ -117,26 +121,32 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
             'an IMU message has neither gyro nor accelerometer: both are marked as '
             'absent (covariance -1) or zero'
         )
-    down = None if angular_velocity is None else _orientation(msg)
     return ImuSample(stamp, angular_velocity, linear_acceleration, down)
 
 
-def _orientation(msg: Any) -> tuple[float, float, float, float] | None:
-    """Down and its sigma [rad]; None without usable variances (0: unknown by REP-145)."""
-    q, covariance = msg.orientation, msg.orientation_covariance
-    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
-    about_x, about_y = float(covariance[0]), float(covariance[4])
-    variance = max(about_x, about_y)
+def _down(msg: Any) -> tuple[float, float, float, float] | None:
+    """Down in the axes of the IMU and its sigma [rad], by the orientation of the message.
+
+    None if the orientation is no unit quaternion, or has no usable variances: by REP-145 a
+    variance of 0 means that it is unknown.
+    """
+    quaternion = msg.orientation
+    x = float(quaternion.x)
+    y = float(quaternion.y)
+    z = float(quaternion.z)
+    w = float(quaternion.w)
     norm2 = x * x + y * y + z * z + w * w
-    if not (about_x > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
+    about_x = float(msg.orientation_covariance[0])
+    about_y = float(msg.orientation_covariance[4])
+    variance = max(about_x, about_y)
+    has_variance = about_x > 0.0 and variance < math.pi**2
+    if not has_variance or not abs(norm2 - 1.0) < 0.02:
         return None
     # Minus the third row of R(q), world from IMU.
-    return (
-        -2.0 * (x * z - w * y) / norm2,
-        -2.0 * (y * z + w * x) / norm2,
-        -(w * w - x * x - y * y + z * z) / norm2,
-        math.sqrt(variance),
-    )
+    down_x = -2.0 * (x * z - w * y) / norm2
+    down_y = -2.0 * (y * z + w * x) / norm2
+    down_z = -(w * w - x * x - y * y + z * z) / norm2
+    return down_x, down_y, down_z, math.sqrt(variance)
 
 
 def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:
@@ -172,6 +182,7 @@ class Part(NamedTuple):
     read: Callable[[Any], Any]
 
 
+# What the node and the readers of bags accept in each role. [derived: interface]
 PARTS: Mapping[Role, Part] = {
     Role.IMU: Part(('sensor_msgs/msg/Imu',), imu_sample_from_message),
     Role.ACCEL: Part(('sensor_msgs/msg/Imu',), partial(imu_sample_from_message, with_gyro=False)),
@@ -183,7 +194,7 @@ PARTS: Mapping[Role, Part] = {
 }
 
 
-# Those of camera and IMU.
+# Roles of the topics that camera and IMU publish. [derived: `Role` without the ground truth]
 SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
 
 

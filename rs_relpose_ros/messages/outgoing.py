@@ -22,6 +22,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.camera_info import info_field
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
@@ -30,7 +31,7 @@ from rs_relpose_ros.tracking.images import Pixels
 MessageTypes = Callable[[str], Any]
 
 # Columns of ~/matches, in the order of `inlier_records`. Floats come first:
-# `point_cloud2.read_points_numpy` reads only fields of the type of the first.
+# `point_cloud2.read_points_numpy` reads only fields of the type of the first. [derived: interface]
 _FLOATS = (
     *('u1', 'v1', 'u2', 'v2'),
     *('tau1', 'tau2'),
@@ -38,10 +39,11 @@ _FLOATS = (
     *('x', 'y', 'z'),
     *('u1_gs', 'v1_gs', 'u2_gs', 'v2_gs'),
 )
+# Record of a match: the columns and the number of its track. [derived: interface]
 MATCH_DTYPE = np.dtype([*((name, '<f4') for name in _FLOATS), ('id', '<u4')])
-# Numbers of the types in sensor_msgs/PointField.
+# Numbers of the types in sensor_msgs/PointField. [derived: FLOAT32 and UINT32 there]
 _POINT_FIELDS = {'<f4': 7, '<u4': 6}
-# Name, offset and type of each field, for sensor_msgs/PointField.
+# Name, offset and type of each field, for sensor_msgs/PointField. [derived: the record]
 MATCH_FIELDS = tuple(
     (name, int(offset), _POINT_FIELDS[dtype.str])
     for name, (dtype, offset, *_) in (MATCH_DTYPE.fields or {}).items()
@@ -54,7 +56,7 @@ LARGE_MESSAGE = 512 * 1024
 # Queue length of a pair topic. A shorter one loses pairs while a subscriber is busy; a longer one
 # costs memory alone. [chosen: three seconds of pairs at 30 Hz; one second to a minute would do]
 PAIR_HISTORY = 100
-# Topics of a pair in the order of publication, and their types.
+# Topics of a pair in the order of publication, and their types. [derived: interface]
 PAIR_TOPICS = {
     'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
     'reference': 'sensor_msgs/msg/TimeReference',
@@ -63,14 +65,15 @@ PAIR_TOPICS = {
     'relative_rotation': 'sensor_msgs/msg/Imu',
     'pairs': 'diagnostic_msgs/msg/DiagnosticArray',
 }
-# Published only for pairs with a pose.
+# Topics that are published only for pairs with a pose. [derived: interface]
 POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
+# Topic of the image on which `draw_pair` draws. [derived: interface]
 DEBUG_IMAGE = 'debug_image'
 
 # Quality of derotated JPEG images. Below it matching suffers, above it messages grow without use.
 # [chosen: the default of image_transport, so that both kinds of publishers send alike]
 _JPEG_QUALITY = 95
-# Integer fields of sensor_msgs/RegionOfInterest.
+# Integer fields of sensor_msgs/RegionOfInterest. [derived: its definition]
 _REGION = ('x_offset', 'y_offset', 'height', 'width')
 # Least eigenvalue of a published covariance, relative to the largest one. The covariance of a
 # direction has rank 5; with an eigenvalue that rounding made negative it could not be inverted or
@@ -97,12 +100,12 @@ class PairValue(NamedTuple):
             return number(value)
         if self.kind == 'findings':
             return findings_text.message_json(value)
+        if value is None:
+            return ''
         if self.kind == 'packed':
-            return (
-                '' if value is None else base64.b64encode(value.astype('<f4').tobytes()).decode()
-            )
+            return base64.b64encode(value.astype('<f4').tobytes()).decode()
         if self.kind in ('vector', 'reals'):
-            return '' if value is None else ' '.join(map(number, value))
+            return ' '.join(map(number, value))
         return str(value)
 
     def value(self, text: str) -> Any:
@@ -114,9 +117,7 @@ class PairValue(NamedTuple):
         if self.kind == 'time':
             # At most the digits of an int64.
             if not (text.isascii() and text.isdigit() and len(text) < 20):
-                raise InputError(
-                    f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}'
-                )
+                raise self._error('a timestamp [ns]', text[:40])
             return int(text)
         if self.kind == 'packed':
             return self._unpacked(text)
@@ -125,14 +126,17 @@ class PairValue(NamedTuple):
         except ValueError:
             values = []
         if text and not (values and all(map(math.isfinite, values))):
-            raise InputError(f'{self.key} of ~/pairs must be finite, got {text[:60]!r}')
+            raise self._error('finite', text[:60])
         if self.kind == 'real':
             return values[0] if values else math.nan
         if self.kind == 'vector':
             values = values or [math.nan] * 3
             if len(values) != 3:
-                raise InputError(f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
+                raise self._error('three numbers', text[:60])
         return np.array(values)
+
+    def _error(self, legal: str, text: str) -> InputError:
+        return InputError(f'{self.key} of ~/pairs must be {legal}, got {text!r}')
 
     def _unpacked(self, text: str) -> Array:
         try:
@@ -141,9 +145,7 @@ class PairValue(NamedTuple):
         except ValueError:
             values = np.full(1, np.nan)
         if not np.isfinite(values).all():
-            raise InputError(
-                f'{self.key} of ~/pairs must be finite float32 in base64, got {text[:60]!r}'
-            )
+            raise self._error('finite float32 in base64', text[:60])
         return values
 
 
@@ -162,7 +164,7 @@ def _image_value(
     return PairValue(key, kind, part)
 
 
-# `TOPICS_KEY` follows: the other topics of the pair.
+# Values of the status by their keys, in the order of the message. [derived: interface]
 PAIR_VALUES = {
     value.key: value
     for value in (
@@ -212,6 +214,7 @@ PAIR_VALUES = {
         PairValue('findings', 'findings', lambda pair: pair.health, 'findings'),
     )
 }
+# The last key of the status: it lists the other topics of the pair. [derived: interface]
 TOPICS_KEY = 'topics'
 
 
@@ -232,32 +235,28 @@ def pair_parts(
     in_reference = header(stamp_ns, reference_frame or f'{result.frame_id}_reference', types)
     # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
     # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
-    parts = (
-        {}
-        if not pose
-        else {
-            'relative_pose': lambda: types('geometry_msgs/msg/PoseWithCovarianceStamped')(
-                header=in_reference,
-                pose=types('geometry_msgs/msg/PoseWithCovariance')(
-                    pose=_pose(pose.R, pose.t, types),
-                    covariance=published_covariance(pose.covariance),
-                ),
+    parts: dict[str, Callable[[], Any]] = {}
+    if pose:
+        parts['relative_pose'] = lambda: types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+            header=in_reference,
+            pose=types('geometry_msgs/msg/PoseWithCovariance')(
+                pose=_pose(pose.R, pose.t, types),
+                covariance=published_covariance(pose.covariance),
             ),
-            'reference': lambda: types('sensor_msgs/msg/TimeReference')(
-                header=in_camera,
-                time_ref=_time(result.reference_stamp_ns, types),
-                source='reference_keyframe',
+        )
+        parts['reference'] = lambda: types('sensor_msgs/msg/TimeReference')(
+            header=in_camera,
+            time_ref=_time(result.reference_stamp_ns, types),
+            source='reference_keyframe',
+        )
+        # Of the current camera: angular in rad/s, linear in baselines per second.
+        parts['velocity'] = lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+            header=in_camera,
+            twist=twist_message(
+                pose.linear_velocity2, pose.angular_velocity2, pose.velocity_covariance, types
             ),
-            # Of the current camera: angular in rad/s, linear in baselines per second.
-            'velocity': lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
-                header=in_camera,
-                twist=twist_message(
-                    pose.linear_velocity2, pose.angular_velocity2, pose.velocity_covariance, types
-                ),
-            ),
-            'matches': lambda: _matches_message(inlier_records(result), in_reference, types),
-        }
-    )
+        )
+        parts['matches'] = lambda: _matches_message(inlier_records(result), in_reference, types)
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
         # ``~/relative_pose``; the rates are those of ``~/velocity``.
@@ -320,7 +319,9 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     the landmark in the reference camera [baselines], global-shutter pixels at the stamped
     rows.
     """
-    inliers, found, matches = result.pose.inliers, result.landmarks, result.matches
+    inliers = result.pose.inliers
+    matches = result.matches
+    found = result.landmarks
     assert found is not None, 'only pairs with a pose have inliers to publish'
     table = np.column_stack(
         [
@@ -343,8 +344,7 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
 # -- messages of any kind --------------------------------------------------------------------
 
 
-_UNKNOWN_COVARIANCES: Mapping[str, Array] = {}
-# Covariance of a sensor that does not exist (REP-145).
+# Covariance of a sensor that does not exist. [derived: REP-145]
 _ABSENT_COVARIANCE = np.diag([-1.0, 0.0, 0.0]).ravel()
 
 
@@ -409,7 +409,7 @@ def imu_message(
     types: MessageTypes,
     *,
     orientation: ArrayLike | None = None,
-    covariances: Mapping[str, Array] = _UNKNOWN_COVARIANCES,
+    covariances: Mapping[str, Array] | None = None,
 ) -> Any:
     """sensor_msgs/Imu (REP-145).
 
@@ -417,15 +417,19 @@ def imu_message(
     absent measurement: the first element of its covariance is -1. `covariances`: 9 elements by
     the name of a measurement; others are unknown.
     """
+    known = covariances or {}
     fields = {}
     for name, kind, absent, value in (
         ('orientation', 'Quaternion', (0.0, 0.0, 0.0, 1.0), orientation),
         ('angular_velocity', 'Vector3', (0.0, 0.0, 0.0), angular_velocity),
         ('linear_acceleration', 'Vector3', (0.0, 0.0, 0.0), linear_acceleration),
     ):
-        fields[name] = geometry_message(kind, absent if value is None else value, types)
-        covariance = np.ravel(covariances.get(name, np.zeros(9)))
-        fields[f'{name}_covariance'] = _ABSENT_COVARIANCE if value is None else covariance
+        covariance = np.ravel(known.get(name, np.zeros(9)))
+        if value is None:
+            value = absent
+            covariance = _ABSENT_COVARIANCE
+        fields[name] = geometry_message(kind, value, types)
+        fields[f'{name}_covariance'] = covariance
     return types('sensor_msgs/msg/Imu')(header=header(stamp_ns, frame_id, types), **fields)
 
 
@@ -459,13 +463,11 @@ def encode_pixels(pixels: Pixels, *, png: bool) -> tuple[str, bytes]:
     """Kind, 'jpeg' or 'png', and content of a file; 16 bits are always PNG."""
     values, name = pixels
     if name.startswith('rgb'):
-        values = cv2.cvtColor(
-            values, cv2.COLOR_RGBA2BGRA if name == 'rgba8' else cv2.COLOR_RGB2BGR
-        )
+        conversion = cv2.COLOR_RGBA2BGRA if name == 'rgba8' else cv2.COLOR_RGB2BGR
+        values = cv2.cvtColor(values, conversion)
     kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
-    _, data = cv2.imencode(
-        f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == 'jpeg' else []
-    )
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == 'jpeg' else []
+    _, data = cv2.imencode(f'.{kind}', values, options)
     return kind, data.tobytes()
 
 
@@ -494,7 +496,9 @@ def camera_info_message(
 ) -> Any:
     """sensor_msgs/CameraInfo: that of `published` (ROS 1 or 2), or of the full sensor for None."""
     if published is None:
-        model, binning, region = camera.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
+        model = camera.distortion_model
+        binning = (0, 0)
+        region = dict.fromkeys(_REGION, 0)
         pinhole = camera.global_shutter_camera() if isinstance(camera, Intrinsics) else camera
         p = np.zeros((3, 4))
         p[:, :3] = pinhole.camera_matrix
@@ -601,19 +605,27 @@ def _is_rclpy(message_type: Any) -> bool:
 
 Color = NDArray[np.uint8]
 
-# Largest width [px]; wider images are reduced, because publishing large messages is slow.
+# Largest width [px]. A wider image is reduced, because publishing large messages is slow.
+# [chosen: half of a screen; 640 to 1920 would do]
 _MAX_WIDTH = 960
+# Width of the bar with the colours of the rows [px]. [chosen: 8 to 30 would be readable]
 _BAR_WIDTH = 14
+# Height of the line of text below the image [px]. [derived: the font with a margin]
 _CAPTION_HEIGHT = 24
+# Colour of outliers: cyan does not occur among those of the rows. [chosen: for its contrast]
 _OUTLIER = (255, 255, 0)
+# Colour of all text. [chosen: for its contrast to the darkened image]
 _WHITE = (255, 255, 255)
+# Size of the text: the caption fits into a width of 640 px. [chosen: 0.35 to 0.5 would do]
 _FONT_SCALE = 0.42
-# From the first row to the last one (216, 3).
+# Colours (216, 3) from the first row to the last one. [chosen: the dark end of the map is left
+# out, as it cannot be distinguished from the image]
 _COLORS = np.asarray(
     cv2.applyColorMap(np.arange(40, 256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0],
     dtype=np.uint8,
 )
-# Fractional bits of the coordinates that OpenCV draws at.
+# Fractional bits of the coordinates that OpenCV draws at. [chosen: a sixteenth of a pixel is not
+# visible; 3 to 8 would do]
 _SHIFT = 4
 
 
@@ -629,34 +641,52 @@ def draw_pair(result: PairResult) -> Color:
     # Two thirds of the brightness, for the contrast of the lines.
     gray = cv2.resize(result.image2, size, interpolation=cv2.INTER_AREA) // 3 * 2
     canvas = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    points1, points2 = result.matches.points1, result.matches.points2
     inliers = result.pose.inliers
-    if len(inliers) != len(points1):  # a pair without an estimate has none
-        inliers = np.zeros(len(points1), dtype=bool)
-    colors = _COLORS[(points2[:, 1] / height * len(_COLORS)).astype(int)].tolist()
-    # Pixel centres lie at integer coordinates.
-    scaled = (np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5
-    ends = np.round(scaled * (1 << _SHIFT)).astype(int)
-    for (start, end), inlier, color in zip(ends.tolist(), inliers, colors, strict=True):
-        color = color if inlier else _OUTLIER
-        cv2.line(canvas, start, end, color, 1, cv2.LINE_AA, _SHIFT)
-        cv2.circle(canvas, end, 2 << _SHIFT, color, -1, cv2.LINE_AA, _SHIFT)
-    if len(points2) and np.ptp(points2[:, 1]) >= 1.0:
-        canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
-        line = np.polyfit(points2[:, 1], result.matches.row_times[1], 1)
-        times = np.polyval(line, (0, height - 1))
-        for time, y in zip(times, (14, len(canvas) - 6), strict=True):
-            _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y))
+    if len(inliers) != len(result.matches):  # a pair without an estimate has none
+        inliers = np.zeros(len(result.matches), dtype=bool)
+    _draw_matches(canvas, result.matches, inliers, height, scale)
+    _draw_row_times(canvas, result.matches, height)
+    caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
+    _write(caption, _caption(result, int(inliers.sum())), (6, 16))
+    return np.concatenate([canvas, caption])
+
+
+def _draw_matches(
+    canvas: Color, matches: Matches, inliers: NDArray[np.bool_], height: int, scale: float
+) -> None:
+    """Draw a line for each match; its dot is the point in the current image of `height` rows."""
+    rows = matches.points2[:, 1]
+    colors = _COLORS[(rows / height * len(_COLORS)).astype(int)].tolist()
+    points = np.stack([matches.points1, matches.points2], axis=1)
+    scaled = (points + 0.5) * scale - 0.5  # pixel centres lie at integer coordinates
+    ends = np.round(scaled * (1 << _SHIFT)).astype(int).tolist()
+    for (start, end), inlier, color in zip(ends, inliers, colors, strict=True):
+        drawn = color if inlier else _OUTLIER
+        cv2.line(canvas, start, end, drawn, 1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(canvas, end, 2 << _SHIFT, drawn, -1, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_row_times(canvas: Color, matches: Matches, height: int) -> None:
+    """Draw the colours of the `height` rows, and the times of the first and of the last one."""
+    rows = matches.points2[:, 1]
+    if not len(rows) or np.ptp(rows) < 1.0:
+        return
+    canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
+    line = np.polyfit(rows, matches.row_times[1], 1)
+    first, last = np.polyval(line, (0, height - 1))
+    for time, y in ((first, 14), (last, len(canvas) - 6)):
+        # Adding zero makes a negative zero positive.
+        _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y))
+
+
+def _caption(result: PairResult, inliers: int) -> str:
     pose = result.pose
     model = f' {pose.diagnostics.model}' if pose else ''
     residual = f', residual {pose.diagnostics.residual_rms:.2f} px' if pose else ''
-    caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
-    text = (
-        f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
+    return (
+        f'{pose.status.value}{model}: {inliers} of {len(result.matches)} matches, '
         f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}'
     )
-    _write(caption, text, (6, 16))
-    return np.concatenate([canvas, caption])
 
 
 def _write(canvas: Color, text: str, place: tuple[int, int]) -> None:

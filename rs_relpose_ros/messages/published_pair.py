@@ -296,61 +296,21 @@ def _with_pose(pair: PublishedPair, messages: Mapping[str, Any]) -> PublishedPai
     )
 
 
-def _without_rotation() -> dict[str, Any]:
-    """Fields of a pair without rotation and pose."""
-    return {
-        'R': np.full((3, 3), math.nan),
-        't': np.full(3, math.nan),
-        'covariance': np.full((6, 6), math.nan),
-        'linear_velocity': np.full(3, math.nan),
-        'angular_velocity': np.full(3, math.nan),
-        'velocity_covariance': np.full((6, 6), math.nan),
-        'matches': np.empty(0, MATCH_DTYPE),
-    }
-
-
-def _of_pose(messages: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a pair with a pose."""
-    pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
-    linear, angular = twist.twist.linear, twist.twist.angular
-    return {
-        'R': _rotation('~/relative_pose', pose.pose.orientation),
-        't': _unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
-        'covariance': _covariance('~/relative_pose', pose.covariance, 6),
-        'linear_velocity': _velocity('the linear velocity of ~/velocity', linear),
-        'angular_velocity': _velocity('the angular velocity of ~/velocity', angular),
-        'velocity_covariance': _covariance('~/velocity', twist.covariance, 6),
-        'matches': match_records(messages['matches']),
-    }
-
-
-def _of_rotation(imu: Any) -> dict[str, Any]:
-    """Fields of a pair whose rotation is known; the other parts of its covariances are NaN."""
-    topic = '~/relative_rotation'
-    covariance, velocity_covariance = np.full((2, 6, 6), math.nan)
-    covariance[3:, 3:] = _covariance(topic, imu.orientation_covariance, 3)
-    velocity_covariance[3:, 3:] = _covariance(topic, imu.angular_velocity_covariance, 3)
-    return {
-        'R': _rotation(topic, imu.orientation),
-        'covariance': covariance,
-        'angular_velocity': _velocity(f'the angular velocity of {topic}', imu.angular_velocity),
-        'velocity_covariance': velocity_covariance,
-    }
-
-
 def match_records(cloud: Any) -> NDArray[np.void]:
     """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory."""
-    names = [str(field.name)[:20] for field in cloud.fields[:20]]
     found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
     wanted = [(*field, 1) for field in outgoing.MATCH_FIELDS]
-    if found != wanted or int(cloud.point_step) != MATCH_DTYPE.itemsize or cloud.is_bigendian:
+    point_size = MATCH_DTYPE.itemsize
+    if found != wanted or int(cloud.point_step) != point_size or cloud.is_bigendian:
+        names = ' '.join(name[:20] for name, *_ in found[:20])
+        endian = 'big' if cloud.is_bigendian else 'little'
         raise InputError(
             f'~/matches must have the fields {" ".join(MATCH_DTYPE.names or ())}, little endian, '
-            f'{MATCH_DTYPE.itemsize} bytes a point; got {" ".join(names) or "none"}, '
-            f'{"big" if cloud.is_bigendian else "little"} endian, {int(cloud.point_step)} bytes'
+            f'{point_size} bytes a point; got {names or "none"}, {endian} endian, '
+            f'{int(cloud.point_step)} bytes'
         )
     data = np.frombuffer(cloud.data, dtype=np.uint8)
-    size = int(cloud.width) * int(cloud.height) * MATCH_DTYPE.itemsize
+    size = int(cloud.width) * int(cloud.height) * point_size
     if len(data) != size:
         raise InputError(
             f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
@@ -363,11 +323,14 @@ def match_records(cloud: Any) -> NDArray[np.void]:
 
 def _refuse_damaged(records: NDArray[np.void]) -> None:
     """InputError if matches are not finite, or their rays no directions."""
-    # A match without a landmark has NaN in x, y and z.
-    far = np.isnan(records['x']) & np.isnan(records['y']) & np.isnan(records['z'])
+    landmark = ('x', 'y', 'z')
+    # A match without a landmark has NaN in all three of these.
+    is_without = np.logical_and.reduce([np.isnan(records[name]) for name in landmark])
     for name in MATCH_DTYPE.names or ():
-        finite = np.isfinite(records[name])
-        if not (finite | far if name in ('x', 'y', 'z') else finite).all():
+        is_good = np.isfinite(records[name])
+        if name in landmark:
+            is_good |= is_without
+        if not is_good.all():
             raise InputError('~/matches must be finite')
     for view in '12':
         lengths = np.linalg.norm(_rays(records, view), axis=1)
@@ -426,8 +389,6 @@ def _rotation(topic: str, quaternion: Any) -> Array:
 # Squared sine of the angle between two rays, below which they count as parallel and have no
 # distances. A larger bound would lose far tracks. [chosen: 1e-24, rounding, to 1e-10 would do]
 _PARALLEL = 1e-18
-# Sigma of a normal distribution over its median absolute deviation. [derived: 1 / 0.6745]
-_OF_DEVIATION = 1.4826
 # Sigma of the median of n normal deviates, over sigma / sqrt(n). [derived: sqrt(pi / 2)]
 _OF_MEDIAN = 1.2533
 
@@ -450,12 +411,12 @@ class PathStep:
     tracks, without the errors of the two poses, which are common to all tracks.
     """
 
-    poses: tuple[PathPose, ...]
-    new_path: str  # empty if the path continues, or none begins
-    new_axes: bool  # whether the axes are unrelated to the former, too
-    scale: float  # the pair's baseline, in baselines of the path's first; NaN without a pose
-    shared_tracks: int  # for the scale relative to the last pair with a pose
-    scale_sigma: float  # 1 sigma of that ratio, relative; NaN without one
+    poses: tuple[PathPose, ...] = ()
+    new_path: str = ''  # empty if the path continues, or none begins
+    new_axes: bool = False  # whether the axes are unrelated to the former, too
+    scale: float = math.nan  # the pair's baseline, in baselines of the path's first
+    shared_tracks: int = 0  # for the scale relative to the last pair with a pose
+    scale_sigma: float = math.nan  # 1 sigma of that ratio, relative
 
 
 class PoseChain:
@@ -491,42 +452,42 @@ class PoseChain:
         """Append a pair, to the path or as the first of a new one."""
         if self._R is not None and pair.reference_stamp_ns != self._stamp_ns:
             self._end('a pair is missing', new_axes=True)
-        scale, shared_tracks, sigma = self._rescaled(pair) if pair else (math.nan, 0, math.nan)
+        step = self._rescaled(pair) if pair else PathStep()
         if not pair.rotation_known:
             self._end(f'a pair has no rotation ({pair.status})', new_axes=True)
-            return PathStep((), '', False, scale, shared_tracks, sigma)
+            return step
         start = np.eye(3) if self._R is None else self._R
         self._stamp_ns = pair.stamp_ns
         self._R = start @ pair.R
         if not pair and pair.status != Status.PURE_ROTATION.value:
             self._end(f'a pair has no translation ({pair.status})')
-            return PathStep((), '', False, scale, shared_tracks, sigma)
-        poses, new_path, new_axes = [], '', False
+            return step
         if self._position is None:
             self._position = np.zeros(3)
-            poses.append(PathPose(pair.reference_stamp_ns, start, self._position))
-            new_path, new_axes, self._new_axes = self._reason, self._new_axes, False
-        movement = scale * pair.t if pair else np.zeros(3)  # in the reference camera
-        self._position = self._position + start @ movement
-        poses.append(PathPose(pair.stamp_ns, self._R, self._position))
-        return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, sigma)
+            first = PathPose(pair.reference_stamp_ns, start, self._position)
+            step = replace(step, poses=(first,), new_path=self._reason, new_axes=self._new_axes)
+            self._new_axes = False
+        if pair:
+            self._position = self._position + start @ (step.scale * pair.t)
+        current = PathPose(pair.stamp_ns, self._R, self._position)
+        return replace(step, poses=(*step.poses, current))
 
-    def _rescaled(self, pair: PublishedPair) -> tuple[float, int, float]:
-        """Scale of a pair with a pose, its shared tracks, and the relative sigma of the ratio."""
-        distances1, distances2 = track_distances(pair)
-        shared = distances1.keys() & self._distances.keys()
-        ratios = np.array([self._distances[track] / distances1[track] for track in shared])
+    def _rescaled(self, pair: PublishedPair) -> PathStep:
+        """Move the scale of the path to a pair with a pose; the step has no poses yet."""
+        of_reference, of_current = track_distances(pair)
+        shared = of_reference.keys() & self._distances.keys()
+        ratios = np.array([self._distances[track] / of_reference[track] for track in shared])
         if self._scale is not None and len(ratios) < self._min_shared_tracks:
             self._end(f'{len(ratios)} shared tracks, the scale needs {self._min_shared_tracks}')
-        self._distances = distances2
+        self._distances = of_current
         if self._scale is None:
             self._scale = 1.0
-            return self._scale, 0, math.nan
+            return PathStep(scale=1.0)
         median = float(np.median(ratios))
         self._scale *= median
-        # The sigma of the median of n normal deviates is sqrt(pi / 2) sigma / sqrt(n).
         scatter = robust_scale(ratios - median, 0.0, 0.0) / median
-        return self._scale, len(ratios), 1.2533 * scatter / math.sqrt(len(ratios))
+        sigma = _OF_MEDIAN * scatter / math.sqrt(len(ratios))
+        return PathStep(scale=self._scale, shared_tracks=len(ratios), scale_sigma=sigma)
 
     def _end(self, reason: str, *, new_axes: bool = False) -> None:
         """End the path, with its axes if these are `new`; the first reason is the next path's."""
@@ -544,13 +505,14 @@ def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, fl
     By least squares of (4) of ``docs/conventions.md``, with the velocity of the current camera
     for both; without tracks behind a camera or with parallel rays.
     """
-    m = pair.matches
-    f1, f2 = _rays(m, '1'), _rays(m, '2') @ pair.R.T
-    tau = m['tau2'].astype(np.float64) - m['tau1']
+    matches = pair.matches
+    rays1 = _rays(matches, '1')
+    rays2 = _rays(matches, '2') @ pair.R.T
+    row_times = matches['tau2'].astype(np.float64) - matches['tau1']
     velocity = pair.R @ pair.linear_velocity  # in the reference camera
-    baselines = pair.t + tau[:, None] * velocity
-    l1, l2, usable = depths_of_rays(f1, f2, baselines, _PARALLEL)
-    tracks = m['id'][usable].tolist()
-    of_reference = zip(tracks, l1[usable].tolist(), strict=True)
-    of_current = zip(tracks, l2[usable].tolist(), strict=True)
+    baselines = pair.t + row_times[:, None] * velocity
+    distances1, distances2, usable = depths_of_rays(rays1, rays2, baselines, _PARALLEL)
+    tracks = matches['id'][usable].tolist()
+    of_reference = zip(tracks, distances1[usable].tolist(), strict=True)
+    of_current = zip(tracks, distances2[usable].tolist(), strict=True)
     return dict(of_reference), dict(of_current)

@@ -4,24 +4,28 @@ A transform is the pose of a child frame in a parent: x y z [m], quaternion x y 
 plain transforms, for the buffer of tf2_ros (live) and the messages of a bag alike.
 """
 
+from collections.abc import Iterator
 from itertools import islice
 import logging
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.geometry import Array
 
 Transform = tuple[float, ...]
 
-# Doubt of a transform, 1 sigma per axis. URDFs hold drawings, not calibrations: a smaller sigma
-# would report the tolerance of a mount as a contradiction, a larger one would hide a wrong
-# transform. [chosen: 2 to 8 deg and 1 to 5 cm would do]
+# Doubt of the rotation of a transform, 1 sigma per axis [rad]. URDFs hold drawings, not
+# calibrations: a smaller sigma would report the tolerance of a mount as a contradiction, a larger
+# one would hide a wrong transform. [chosen: 2 to 8 deg would do]
 AXES_SIGMA = math.radians(5.0)
-POSITION_SIGMA = 0.02  # [m]
+# Doubt of the position of a transform, 1 sigma per axis [m], for the same reasons. [chosen: 1 to 5
+# cm would do]
+POSITION_SIGMA = 0.02
+# Type of the messages on /tf and /tf_static. [derived: interface of ROS]
 TF_TYPE = 'tf2_msgs/msg/TFMessage'
 # Number of messages of /tf that are read for a frame that /tf_static does not connect. More would
 # delay the start with a long bag, fewer miss a publisher of 1 Hz among fast ones.
@@ -35,21 +39,23 @@ class FrameTree:
     """Transforms by child; of several for one child the first one holds."""
 
     def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
+        self._parents: dict[str, tuple[str, Array]] = {}
 
     def add(self, message: Any) -> None:
-        """Add those of a tf2_msgs/TFMessage that are rigid transforms."""
+        """Add the transforms of a tf2_msgs/TFMessage that are rigid."""
         for stamped in message.transforms:
-            t, q = stamped.transform.translation, stamped.transform.rotation
-            quaternion = np.array([q.x, q.y, q.z, q.w])
+            position = stamped.transform.translation
+            rotation = stamped.transform.rotation
+            quaternion = [rotation.x, rotation.y, rotation.z, rotation.w]
             pose = np.eye(4)
-            pose[:3, 3] = t.x, t.y, t.z
+            pose[:3, 3] = position.x, position.y, position.z
             is_unit = abs(np.linalg.norm(quaternion) - 1.0) < 1e-2
             if is_unit and np.isfinite(pose).all():
                 pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
                 # ROS 1 has names with and without a slash.
-                child, parent = stamped.child_frame_id, stamped.header.frame_id
-                self._parents.setdefault(child.lstrip('/'), (parent.lstrip('/'), pose))
+                child = stamped.child_frame_id.lstrip('/')
+                parent = stamped.header.frame_id.lstrip('/')
+                self._parents.setdefault(child, (parent, pose))
 
     def lookup(self, parent: str, child: str) -> Transform | None:
         """Pose of `child` in `parent`; None if they are not connected."""
@@ -59,9 +65,11 @@ class FrameTree:
             return None
         pose = np.linalg.inv(of_parent) @ of_child
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        return *pose[:3, 3].tolist(), *quaternion.tolist()
+        position = pose[:3, 3].tolist()
+        return *position, *quaternion.tolist()
 
-    def _in_root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
+    def _in_root(self, frame: str) -> tuple[str, Array]:
+        """The frame without a parent above a frame, and the pose (4, 4) of the frame in it."""
         frame, pose = frame.lstrip('/'), np.eye(4)
         for _ in self._parents:  # at most: a circle has no root
             if frame in self._parents:
@@ -70,8 +78,8 @@ class FrameTree:
         return frame, pose
 
 
-def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: float) -> float:
-    """Angle [deg] by which a rotation of `sigma` [rad] contradicts that of a transform; else 0."""
+def angle_between(R: Array, other: Array, sigma: float) -> float:
+    """Angle [deg] between two rotations, R of `sigma` [rad]; 0 where they may be the same."""
     angle = float(Rotation.from_matrix(R @ other.T).magnitude())
     allowed = math.hypot(AXES_SIGMA, 3.0 * sigma)
     return math.degrees(angle) if angle > allowed else 0.0
@@ -80,12 +88,14 @@ def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: flo
 def extrinsics(
     parameters: Parameters, found: Transform, camera: str, imu: str
 ) -> tuple[dict[str, Any], str]:
-    """Parameters by the pose `found` of the IMU in the camera, or a contradiction."""
-    sensor, position = parameters.sensor, parameters.imu.imu_position
-    rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
+    """Parameters by the pose `found` of the IMU in the camera; and a contradiction, or ''."""
+    sensor = parameters.sensor
+    position = parameters.imu.imu_position
+    rotation = Rotation.from_quat(found[3:])
+    head = f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
     if sensor.quat_cam_imu_xyzw is None:
-        values = {'quat_cam_imu_xyzw': tuple(rotation.as_quat().tolist())}
+        values['quat_cam_imu_xyzw'] = tuple(rotation.as_quat().tolist())
         values['axes_sigma'] = AXES_SIGMA
     elif angle := angle_between(rotation.as_matrix(), sensor.R_cam_imu, sensor.axes_sigma):
         return {}, (
@@ -126,27 +136,29 @@ class BagFrames(NamedTuple):
 
 
 def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
-    """Frames of a `Bag` with `SensorTopics`; of /tf if /tf_static does not suffice (`base`)."""
+    """Frames of a `Bag` with `SensorTopics`.
+
+    /tf is read, too, until IMU and camera are connected, and the camera and `base` if it is given.
+    """
     camera, imu = _frame_id(bag, topics.image), _frame_id(bag, topics.imu)
     frames = BagFrames(camera, imu, FrameTree())
 
-    def is_complete() -> bool:
-        base_known = not base or frames.tree.lookup(base, camera) is not None
-        return frames.imu_in_camera is not None and base_known
+    def messages_of(name: str) -> Iterator[Any]:
+        topics = [one for one in bag.topics if (one.name, one.msgtype) == (name, TF_TYPE)]
+        return (found.message for found in bag.messages(topics))
 
-    for name, most in (('/tf_static', None), ('/tf', _MOST_MESSAGES)):
-        found = [topic for topic in bag.topics if topic.name == name and topic.msgtype == TF_TYPE]
-        for message in islice(bag.messages(found), most):
-            if most is not None and is_complete():
-                break
-            frames.tree.add(message.message)
+    for message in messages_of('/tf_static'):
+        frames.tree.add(message)
+    for message in islice(messages_of('/tf'), _MOST_MESSAGES):
+        base_known = not base or frames.tree.lookup(base, camera) is not None
+        if base_known and frames.imu_in_camera is not None:
+            break
+        frames.tree.add(message)
     return frames
 
 
 def _frame_id(bag: Any, topic: Any) -> str:
     """frame_id of the first message of a topic; empty without one."""
-    if topic is None:
-        return ''
     first = next(iter(bag.messages([topic])), None)
     return '' if first is None else str(first.message.header.frame_id).lstrip('/')
 
