@@ -6,7 +6,7 @@ recorder was killed, or whose files were renamed, can be read.
 """
 
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager, ExitStack, suppress
 import logging
 from pathlib import Path, PurePath
 import re
@@ -36,11 +36,12 @@ _METADATA = 'metadata.yaml'
 # Bytes of the largest metadata.yaml that is parsed. A larger one is ignored; parsing it would take
 # minutes. [chosen: thousands of topics need less than a megabyte]
 _MAX_METADATA_BYTES = 1 << 24
-# A compressed file is decompressed to a temporary one of at most this size [bytes] and so many
-# times its own. Without a bound a file of some kilobytes would fill the disk; a smaller one would
-# refuse recordings that compress well. [chosen: images of noise-free simulations reach 100 times]
+# A compressed file is decompressed to a temporary one, whose size is bounded by the sum of this
+# [bytes] and a multiple of its own. Without a bound a file of some kilobytes would fill the disk.
+# [chosen: what any machine has on its disk; 0.1 to 10 GB would do]
 MAX_FILE_BYTES = 1 << 30
-# [chosen: see above]
+# The multiple. A smaller one would refuse recordings that compress well. [chosen: images of
+# noise-free simulations reach 100 times]
 _MAX_FILE_GROWTH = 200
 # Bytes that are decompressed at once. [chosen: 64 kB to 64 MB]
 _BLOCK = 1 << 20
@@ -56,20 +57,12 @@ class Metadata(NamedTuple):
     parts: dict[str, tuple[float, float, int]]  # start [s], duration [s], messages of a file
 
 
-# What is known of a bag without usable metadata.
+# What is known of a bag without usable metadata. [derived: nothing]
 _NOTHING = Metadata((), {}, {})
 
 
-class OpenFiles(NamedTuple):
-    """The open files of a bag in their order."""
-
-    files: list[Path]
-    storages: list[Storage]
-    metadata: Metadata
-
-
-def open_files(path: Path, stack: ExitStack) -> OpenFiles:
-    """Open the file, or the files of the folder; the stack closes them."""
+def open_files(path: Path, stack: ExitStack) -> tuple[list[Path], list[Storage], Metadata]:
+    """Open the file, or the files of the folder in their order; the stack closes them."""
     if not path.exists():
         raise MissingInputError(f'there is no bag at {path}')
     metadata = _NOTHING
@@ -77,11 +70,31 @@ def open_files(path: Path, stack: ExitStack) -> OpenFiles:
     if path.is_dir():
         metadata = _read_metadata(path / _METADATA)
         files = _files_of(path, metadata)
-    return OpenFiles(files, [_open(file, path, stack) for file in files], metadata)
+    storages = []
+    for file in files:
+        with naming_damage(path, file):
+            storages.append(_open(file, path, stack))
+    return files, storages, metadata
 
 
-def damage(path: Path, file: Path, error: Exception) -> InputError:
-    """The error of a file of the bag at `path` with what may help."""
+@contextmanager
+def naming_damage(path: Path, file: Path) -> Iterator[None]:
+    """Context that reads `file` of the bag at `path`: damage becomes an InputError that names it.
+
+    Damaged bytes can raise anything in the parsers.
+    """
+    try:
+        yield
+    except (MissingInputError, PermissionError, MemoryError):
+        raise
+    except Exception as error:
+        if isinstance(error, InputError) and not isinstance(error, DamagedError):
+            raise
+        raise _damage(path, file, error) from error
+
+
+def _damage(path: Path, file: Path, error: Exception) -> InputError:
+    """The error of a file of the bag at `path`, with what may help."""
     # What the parsers of damaged bytes raise helps nobody: it names places of this code.
     _logger.debug('raised here', exc_info=error)
     reason = str(error) if isinstance(error, DamagedError) else 'its records have no sense'
@@ -227,28 +240,17 @@ def _or(names: Any) -> str:
 
 def _open(file: Path, path: Path, stack: ExitStack) -> Storage:
     """Open a file of the bag at `path` by what its first bytes say."""
-    try:
+    source = _source(file, path)
+    if source is Source.ZSTD:
+        file = _unpacked(file, stack)
         source = _source(file, path)
-        unpacked = _unpacked(file, stack) if source is Source.ZSTD else file
-        source = _source(unpacked, path)
-        storage: Storage
-        if source is Source.MCAP:
-            storage = McapStorage(unpacked)
-        elif source is Source.SQLITE:
-            storage = SqliteStorage(unpacked)
-        elif source is Source.ROS1:
-            storage = Ros1Storage(unpacked)
-        else:
-            raise DamagedError('it begins as no bag does')
-    except (MissingInputError, PermissionError, MemoryError):
-        raise
-    # Damaged bytes can raise anything in the parsers.
-    except Exception as error:
-        if isinstance(error, InputError) and not isinstance(error, DamagedError):
-            raise
-        raise damage(path, file, error) from error
-    stack.callback(storage.close)
-    return storage
+    if source is Source.MCAP:
+        return McapStorage(file, stack)
+    if source is Source.SQLITE:
+        return SqliteStorage(file, stack)
+    if source is Source.ROS1:
+        return Ros1Storage(file, stack)
+    raise DamagedError('it begins as no bag does')
 
 
 def _source(file: Path, path: Path) -> Source | None:

@@ -5,6 +5,7 @@ Records and their fields: https://mcap.dev/spec. All numbers are little-endian.
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 import os
 from pathlib import Path
 import struct
@@ -22,21 +23,39 @@ from rs_relpose_ros.bags.storage import (
     StoredTopic,
 )
 
-# Kinds of records. [derived: the MCAP specification, as the layouts below]
+# All kinds and layouts of records are [derived: the MCAP specification].
+# A footer ends the file.
+_FOOTER = 0x02
+# A schema names and defines a type.
 _SCHEMA = 0x03
-_CHANNEL = 0x04  # a topic
+# A channel is a topic.
+_CHANNEL = 0x04
+# A message may lie in a chunk or outside of all chunks.
 _MESSAGE = 0x05
+# A chunk holds compressed records.
 _CHUNK = 0x06
+# Statistics count the messages of each channel.
 _STATISTICS = 0x0B
+# This record ends the data.
 _DATA_END = 0x0F
-_HEAD = struct.Struct('<BQ')  # of a record: kind and size
-_MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, times of log and of publication
-_CHUNK_HEAD = struct.Struct('<QQQII')  # times, size, checksum, length of the compression's name
-_STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')  # counts; first and last time
-_FOOTER = struct.Struct('<BQQQI8s')  # head, start of the summary, checksum, magic
-_LENGTH = struct.Struct('<I')  # of a text
-_SIZE = struct.Struct('<Q')  # of data
-# Bytes of the longest name of a compression that is read with the head of a chunk.
+# A record begins with its kind and its size.
+_HEAD = struct.Struct('<BQ')
+# A message begins with its channel, its number, and the times of log and of publication.
+_MESSAGE_HEAD = struct.Struct('<HIQQ')
+# A chunk begins with two times, size, checksum, and length of the compression's name.
+_CHUNK_HEAD = struct.Struct('<QQQII')
+# Statistics begin with six counts, and the first and the last time.
+_STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
+# Statistics go on with pairs of a channel and the number of its messages.
+_COUNT = struct.Struct('<HQ')
+# The end of a file has a head, starts of summary and offsets, checksum, and magic.
+_END = struct.Struct('<BQQQI8s')
+# A text begins with its length.
+_LENGTH = struct.Struct('<I')
+# The data of a chunk begin with their size.
+_SIZE = struct.Struct('<Q')
+# Bytes of the longest name of a compression that is read with the head of a chunk. A shorter one
+# would refuse a name, a longer one reads more for nothing. [chosen: known names have four letters]
 _MAX_NAME = 64
 
 
@@ -50,44 +69,28 @@ class _Channel(NamedTuple):
 class McapStorage:
     """An open MCAP file; see `Storage`."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open('rb', buffering=0)
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        self._file = stack.enter_context(path.open('rb', buffering=0))
         self._chunks = KeptChunks(self._load_chunk)
         self._schemas: dict[int, tuple[str, bytes]] = {}
         self._channels: dict[int, _Channel] = {}
         self._counts: Counter[int] = Counter()
         self.start_ns = self.end_ns = 0
-        try:
-            summary = self._find_end()
-            if not (summary and self._read_summary(summary)):
-                self._count_messages()
-        except BaseException:
-            self.close()
-            raise
+        footer, summary = self._find_end()
+        self._end = summary or footer
+        if not (summary and self._read_summary(summary, footer)):
+            self._count_messages()
         self.topics = [self._topic(number) for number in self._channels]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""
         for kind, start, size in self._records(len(Source.MCAP.value), self._end):
             if kind == _CHUNK:
-                yield from self._entries_of_chunk(start)
-            elif kind == _MESSAGE:
-                yield self._entry(self._read(start, size), start, -1)
-            elif kind in (_SCHEMA, _CHANNEL):
-                self._describe(kind, self._read(start, size))
-
-    def _entries_of_chunk(self, place: int) -> Iterator[Entry]:
-        chunk = memoryview(self._chunks[place])
-        for kind, start, size in _records_of(chunk):
-            record = chunk[start : start + size]
-            if kind == _MESSAGE:
-                yield self._entry(record, place, start)
-            elif kind in (_SCHEMA, _CHANNEL):
-                self._describe(kind, bytes(record))
+                chunk = memoryview(self._chunks[start])
+                for inner, offset, length in _records_of(chunk):
+                    yield from self._entry(inner, chunk[offset : offset + length], start, offset)
+            elif kind in (_SCHEMA, _CHANNEL, _MESSAGE):
+                yield from self._entry(kind, self._read(start, size), start, -1)
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""
@@ -98,33 +101,48 @@ class McapStorage:
         _, size = _HEAD.unpack_from(chunk, offset - _HEAD.size)
         return chunk[offset + _MESSAGE_HEAD.size : offset + size]
 
-    def _entry(self, record: bytes | memoryview, place: int, offset: int) -> Entry:
-        channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(record)
-        if channel not in self._channels:
-            raise DamagedError(f'a message belongs to channel {channel}, which is not described')
-        return Entry(channel, time_ns, place, offset, record[_MESSAGE_HEAD.size :])
+    def _entry(
+        self, kind: int, record: bytes | memoryview, place: int, offset: int
+    ) -> Iterator[Entry]:
+        """The entry of a message; a schema or a channel is kept."""
+        if kind == _MESSAGE:
+            channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(record)
+            if channel not in self._channels:
+                raise DamagedError(
+                    f'a message belongs to channel {channel}, which is not described'
+                )
+            yield Entry(channel, time_ns, place, offset, record[_MESSAGE_HEAD.size :])
+        elif kind in (_SCHEMA, _CHANNEL):
+            self._describe(kind, bytes(record))
 
     def _read(self, start: int, size: int) -> bytes:
         return read_exactly(self._file, start, size)
 
-    def _find_end(self) -> int:
-        """Set the end of the data; start of the summary, 0 if there is none."""
-        file_size = os.fstat(self._file.fileno()).st_size
-        footer = max(file_size - _FOOTER.size, len(Source.MCAP.value))
-        kind, size, summary, _, _, magic = _FOOTER.unpack(self._read(footer, _FOOTER.size))
-        if (kind, size, magic) != (0x02, 20, Source.MCAP.value) or summary > footer:
+    def _find_end(self) -> tuple[int, int]:
+        """Places of the footer and of the summary; the latter is 0 if there is none."""
+        magic = Source.MCAP.value
+        footer = max(os.fstat(self._file.fileno()).st_size - _END.size, len(magic))
+        kind, size, summary, _, _, last_bytes = _END.unpack(self._read(footer, _END.size))
+        content = _END.size - _HEAD.size - len(magic)
+        if (kind, size, last_bytes) != (_FOOTER, content, magic) or summary > footer:
             raise DamagedError('it has no end')
-        self._footer, self._end = footer, summary or footer
-        return int(summary)
+        return footer, summary
 
-    def _read_summary(self, summary: int) -> bool:
+    def _read_summary(self, summary: int, footer: int) -> bool:
         """Read topics and counts from the summary; whether it has all."""
-        found = False
-        for kind, start, size in self._records(summary, self._footer):
-            if kind in (_SCHEMA, _CHANNEL, _STATISTICS):
+        has_statistics = False
+        for kind, start, size in self._records(summary, footer):
+            if kind == _STATISTICS:
+                self._use_statistics(self._read(start, size))
+                has_statistics = True
+            elif kind in (_SCHEMA, _CHANNEL):
                 self._describe(kind, self._read(start, size))
-                found |= kind == _STATISTICS
-        return found and bool(self._channels or not self._counts)
+        return has_statistics and bool(self._channels or not self._counts)
+
+    def _use_statistics(self, record: bytes) -> None:
+        *_, self.start_ns, self.end_ns = _STATISTICS_HEAD.unpack_from(record)
+        counts = _Fields(record, _STATISTICS_HEAD.size).bytes()
+        self._counts = Counter(dict(_COUNT.iter_unpack(counts)))
 
     def _count_messages(self) -> None:
         """Read topics and counts from the data."""
@@ -137,21 +155,19 @@ class McapStorage:
         self.start_ns, self.end_ns = first or 0, last or 0
 
     def _describe(self, kind: int, record: bytes) -> None:
-        """Keep a schema, a channel or the statistics."""
+        """Keep a schema or a channel."""
         fields = _Fields(record)
-        if kind == _STATISTICS:
-            *_, self.start_ns, self.end_ns = _STATISTICS_HEAD.unpack_from(record)
-            fields.position = _STATISTICS_HEAD.size
-            counts = fields.bytes()
-            self._counts = Counter(dict(struct.iter_unpack('<HQ', counts)))
-            return
         number = fields.number()
         if kind == _SCHEMA:
-            name, _ = fields.text(), fields.text()
+            name = fields.text()
+            fields.text()  # the encoding of the definition, which is not used
             self._schemas[number] = name, fields.bytes()
             return
-        schema, topic, encoding = fields.number(), fields.text(), fields.text()
-        self._channels[number] = _Channel(schema, topic, encoding, _Fields(fields.bytes()).pairs())
+        schema = fields.number()
+        topic = fields.text()
+        encoding = fields.text()
+        metadata = _Fields(fields.bytes()).pairs()
+        self._channels[number] = _Channel(schema, topic, encoding, metadata)
 
     def _topic(self, number: int) -> StoredTopic:
         channel = self._channels[number]
@@ -184,14 +200,17 @@ class McapStorage:
             start += size
 
     def _load_chunk(self, start: int) -> bytes:
-        head = os.pread(self._file.fileno(), _CHUNK_HEAD.size + _MAX_NAME + _SIZE.size, start)
+        """The records of a chunk, decompressed."""
+        most = _CHUNK_HEAD.size + _MAX_NAME + _SIZE.size
+        head = os.pread(self._file.fileno(), most, start)
         _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(head)
         if length > _MAX_NAME:
             raise DamagedError('a chunk has an unknown compression')
-        name = head[_CHUNK_HEAD.size : _CHUNK_HEAD.size + length].decode()
-        (stored,) = _SIZE.unpack_from(head, _CHUNK_HEAD.size + length)
-        begin = start + _CHUNK_HEAD.size + length + _SIZE.size
-        chunk = chunk_data(self._read(begin, stored), name, size)
+        end_of_name = _CHUNK_HEAD.size + length
+        name = head[_CHUNK_HEAD.size : end_of_name].decode()
+        (stored,) = _SIZE.unpack_from(head, end_of_name)
+        data = self._read(start + end_of_name + _SIZE.size, stored)
+        chunk = chunk_data(data, name, size)
         if checksum and zlib.crc32(chunk) != checksum:
             raise DamagedError('the checksum of a chunk is wrong')
         return chunk
@@ -212,32 +231,32 @@ def _records_of(chunk: memoryview) -> Iterator[tuple[int, int, int]]:
 class _Fields:
     """Reads the fields of a record one after the other."""
 
-    def __init__(self, record: bytes) -> None:
+    def __init__(self, record: bytes, position: int = 0) -> None:
         self._record = record
-        self.position = 0
+        self._position = position
 
     def number(self) -> int:
-        """The next two bytes."""
-        self.position += 2
-        return int.from_bytes(self._record[self.position - 2 : self.position], 'little')
+        """The number in the next two bytes."""
+        self._position += 2
+        return int.from_bytes(self._record[self._position - 2 : self._position], 'little')
 
     def bytes(self) -> bytes:
         """The next field with its length before it."""
-        (length,) = _LENGTH.unpack_from(self._record, self.position)
-        start = self.position + _LENGTH.size
-        self.position = start + length
-        if self.position > len(self._record):
+        (length,) = _LENGTH.unpack_from(self._record, self._position)
+        start = self._position + _LENGTH.size
+        self._position = start + length
+        if self._position > len(self._record):
             raise DamagedError('a field ends beyond its record')
-        return self._record[start : self.position]
+        return self._record[start : self._position]
 
     def text(self) -> str:
         """The next text."""
         return self.bytes().decode()
 
     def pairs(self) -> dict[str, str]:
-        """Names and values until the end."""
+        """All further fields as names and values."""
         found = {}
-        while self.position < len(self._record):
+        while self._position < len(self._record):
             name = self.text()
             found[name] = self.text()
         return found

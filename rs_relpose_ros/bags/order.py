@@ -23,7 +23,7 @@ _FEWEST_AFTER_RESET = 3
 # again. [derived: the mean of both]
 _COVERED_TWICE = 1.5
 # Time [ns] between the end of one run of a clock and the begin of the next one, in the order of
-# reading. Any positive value keeps them apart.
+# reading. It keeps the runs apart. [chosen: any positive value would do]
 _BETWEEN_RUNS_NS = 1_000_000_000
 
 
@@ -54,17 +54,17 @@ def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
     """
     if len(after) < _FEWEST_AFTER_RESET or np.any(after[:_FEWEST_AFTER_RESET] > top):
         return False
+    start = int(after[0])
     passing = np.flatnonzero(after > top)
-    until = int(passing[0]) if len(passing) else len(after)
-    covering = int(np.count_nonzero(after[:until] >= after[0]))
-    above = int(np.count_nonzero(before >= after[0]))
+    catching_up = after[: passing[0]] if len(passing) else after
+    above = int(np.count_nonzero(before >= start))
     if above < _FEWEST_AFTER_RESET:
         return False
-    expected = (top - int(after[0])) / period + 1.0
-    covered_twice = above + covering > _COVERED_TWICE * expected
+    found = above + int(np.count_nonzero(catching_up >= start))
+    expected = (top - start) / period + 1.0
     # Late messages fill a gap; after a jump over all that was recorded most of the time is empty.
-    never_passes = not len(passing) and above + covering < expected / _COVERED_TWICE
-    return covered_twice or never_passes
+    never_passes = not len(passing) and found < expected / _COVERED_TWICE
+    return never_passes or found > _COVERED_TWICE * expected
 
 
 def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:
@@ -73,24 +73,23 @@ def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[in
     `stamps` (N,) [ns] and `topics` (N,), the number of the topic of each, are in the order of the
     file. `sensors` are the numbers of the topics whose clocks decide.
     """
-    by_topic = {int(topic): np.flatnonzero(topics == topic) for topic in np.unique(topics)}
-    runs = {topic: clock_runs(stamps[rows]) for topic, rows in by_topic.items()}
     times = stamps.copy()
-    last = {int(runs[topic][-1]) for topic in sensors if topic in runs}
-    if len(last) == 1:
+    runs = np.zeros(len(stamps), dtype=np.int64)
+    by_topic = {int(topic): np.flatnonzero(topics == topic) for topic in np.unique(topics)}
+    for rows in by_topic.values():
+        runs[rows] = clock_runs(stamps[rows])
+    resets = {int(runs[by_topic[topic][-1]]) for topic in sensors if topic in by_topic}
+    if len(resets) == 1:
         # All clocks were set back equally often, mostly never: one run is read after the other.
-        whole = np.zeros(len(stamps), dtype=np.int64)
-        for topic, rows in by_topic.items():
-            whole[rows] = runs[topic]
         of_sensors = np.isin(topics, list(sensors))
-        for run in range(1, last.pop() + 1):
-            earlier = times[of_sensors & (whole == run - 1)].max()
-            here = whole == run
-            shift = earlier + _BETWEEN_RUNS_NS - times[of_sensors & here].min()
-            times[here] += shift
+        for run in range(1, resets.pop() + 1):
+            here = runs == run
+            end = times[of_sensors & (runs == run - 1)].max()
+            begin = times[of_sensors & here].min()
+            times[here] += end + _BETWEEN_RUNS_NS - begin
     else:
         # A sensor alone was set back: its messages keep the order of the file.
-        for topic, rows in by_topic.items():
-            if runs[topic][-1]:
+        for rows in by_topic.values():
+            if runs[rows[-1]]:
                 times[rows] = np.maximum.accumulate(times[rows])
     return times

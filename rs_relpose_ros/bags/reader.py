@@ -20,15 +20,16 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags import storage
-from rs_relpose_ros.bags.files import damage, open_files, OpenFiles
+from rs_relpose_ros.bags.files import naming_damage, open_files
 from rs_relpose_ros.bags.order import reading_times
-from rs_relpose_ros.bags.storage import message_data, StoredTopic
+from rs_relpose_ros.bags.storage import Entry, message_data, StoredTopic
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
-# Topics and frames of the bags that the project writes.
+# The names of all topics, frames and types here are [derived: interface].
+# The bags that the project writes have their images on this topic.
 COMPRESSED_TOPIC = '/camera/image_raw/compressed'
-# The same, if images are raw.
+# They have them on this topic if images are raw.
 RAW_TOPIC = '/camera/image_raw'
 # Topic of the CameraInfo.
 CAMERA_INFO_TOPIC = '/camera/camera_info'
@@ -48,12 +49,14 @@ IMU_FRAME = 'imu_link'
 # Frame of the true poses.
 WORLD_FRAME = 'world'
 
-# Delay of a driver between the stamp (of an image: the end of its readout) and delivery [s].
+# Delay [s] from the end of an image's readout to its receive time in a written bag. Without one,
+# messages would be received before they are measured. [chosen: drivers need 1 to 20 ms]
 IMAGE_DELAY = 0.005
-# The same of an IMU sample [s].
+# Delay [s] from the stamp of an IMU sample to its receive time in a written bag, for the same
+# reason. [chosen: drivers need 1 to 5 ms]
 IMU_DELAY = 0.002
 
-# Types of the messages that are read.
+# Type of a raw image.
 IMAGE = 'sensor_msgs/msg/Image'
 # Type of a compressed image.
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -273,9 +276,9 @@ class _Index(NamedTuple):
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, files: OpenFiles) -> None:
+    def __init__(self, path: Path, stack: ExitStack) -> None:
         self.path = path
-        self._files, self._storages = files.files, files.storages
+        self._files, self._storages, metadata = open_files(path, stack)
         # Gets the topic of each message that is read, for a progress bar.
         self.on_message: Callable[[str], object] = lambda topic: None
         counts: dict[tuple[str, str], int] = {}
@@ -285,19 +288,20 @@ class Bag:
                 key = topic.name, topic.msgtype
                 if not ''.join(key).isprintable():
                     raise InputError(f'{path} is damaged: a topic has no printable name or type')
-                digest = topic.digest or files.metadata.digests.get(key, '')
+                digest = topic.digest or metadata.digests.get(key, '')
                 self._stored.setdefault(key, topic._replace(digest=digest))
                 counts[key] = counts.get(key, 0) + topic.messages
         self._numbers = {key: number for number, key in enumerate(self._stored)}
         self.topics = tuple(
             Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items())
         )
-        ends = [s for s in self._storages if any(topic.messages for topic in s.topics)]
         # Time from the first to the last message [s].
         self.duration = 0.0
-        if ends:
-            first, last = min(s.start_ns for s in ends), max(s.end_ns for s in ends)
-            self.duration = (last + 1 - first) / NANOSECONDS
+        filled = [s for s in self._storages if any(topic.messages for topic in s.topics)]
+        if filled:
+            first_ns = min(opened.start_ns for opened in filled)
+            last_ns = max(opened.end_ns for opened in filled)
+            self.duration = (last_ns + 1 - first_ns) / NANOSECONDS
 
     def reliability(self, topic: Topic) -> str:
         """``'reliable'`` or ``'best effort'`` as its publishers offered; empty if not recorded."""
@@ -361,15 +365,15 @@ class Bag:
         index = self._index(topics)
         times = self._by_stamp(index) if by_stamp else index.received
         stored = list(self._stored.values())
-        columns = (index.topic, index.file, index.place, index.offset, index.received, times)
         # Equal times are read in the order of the topics' names, whatever the file has first.
         by_name = np.argsort(np.argsort([topic.name for topic in stored]))
         for row in np.lexsort((by_name[index.topic], times)):
-            number, file, place, offset, received, read_ns = (int(one[row]) for one in columns)
-            topic = stored[number]
-            data = self._as_cdr(topic, self._data(file, place, offset))
+            topic = stored[index.topic[row]]
+            place, offset = int(index.place[row]), int(index.offset[row])
+            data = self._as_cdr(topic, self._data(int(index.file[row]), place, offset))
             self.on_message(topic.name)
-            yield RawMessage(topic.name, topic.msgtype, received, data, read_ns)
+            received_ns, read_ns = int(index.received[row]), int(times[row])
+            yield RawMessage(topic.name, topic.msgtype, received_ns, data, read_ns)
 
     def timeline(self, topic: Topic) -> Timeline:
         """Stamps and times of reception of a topic."""
@@ -397,7 +401,7 @@ class Bag:
         for number, opened in enumerate(self._storages):
             topics = {topic.id: topic for topic in opened.topics}
             has_header = {topic.id: _begins_with_header(topic) for topic in opened.topics}
-            for entry in self._guarded(number, opened.entries()):
+            for entry in self._entries(number):
                 topic = topics[entry.topic_id]
                 stamp = entry.time_ns
                 if has_header[topic.id]:
@@ -410,13 +414,11 @@ class Bag:
 
     def _by_stamp(self, index: _Index) -> NDArray[np.int64]:
         """Times of reading [ns], with a CameraInfo at the beginning where there is one."""
-        of_type = {
-            msgtype: [n for (_, kind), n in self._numbers.items() if kind == msgtype]
-            for msgtype in (*_MEASURED, CAMERA_INFO)
-        }
-        sensors = [number for msgtype in _MEASURED for number in of_type[msgtype]]
+        numbers = self._numbers.items()
+        sensors = [number for (_, msgtype), number in numbers if msgtype in _MEASURED]
+        of_info = [number for (_, msgtype), number in numbers if msgtype == CAMERA_INFO]
         times = reading_times(index.stamp, index.topic, sensors)
-        infos = np.flatnonzero(np.isin(index.topic, of_type[CAMERA_INFO]))
+        infos = np.flatnonzero(np.isin(index.topic, of_info))
         if len(infos):
             # It serves the images before it, too: drivers publish it late, or once.
             earliest = infos[np.argmin(times[infos])]
@@ -425,25 +427,15 @@ class Bag:
 
     # -- data --------------------------------------------------------------------------------
 
-    def _guarded(self, number: int, values: Iterator[Any]) -> Iterator[Any]:
-        """Items of a parser; whatever damaged bytes raise becomes an InputError."""
-        try:
-            yield from values
-        except MemoryError:
-            raise
-        except Exception as error:
-            raise self._damage(number, error) from error
+    def _entries(self, number: int) -> Iterator[Entry]:
+        """Entries of a file by its number."""
+        with naming_damage(self.path, self._files[number]):
+            yield from self._storages[number].entries()
 
     def _data(self, number: int, place: int, offset: int) -> bytes:
-        try:
+        """Bytes of a message in the file of a number."""
+        with naming_damage(self.path, self._files[number]):
             return message_data(self._storages[number].data(place, offset))
-        except MemoryError:
-            raise
-        except Exception as error:
-            raise self._damage(number, error) from error
-
-    def _damage(self, number: int, error: Exception) -> InputError:
-        return damage(self.path, self._files[number], error)
 
     def _as_cdr(self, topic: StoredTopic, data: bytes) -> bytes:
         """The data of a message in CDR of ROS 2: headers of ROS 1 have an additional number."""
@@ -486,13 +478,14 @@ class Bag:
             ) from error
 
 
-# Types of the sensors whose clocks decide the order of reading.
+# Types of the sensors whose clocks decide the order of reading. [derived: `reading_times`]
 _MEASURED = (IMAGE, COMPRESSED_IMAGE, IMU)
-# Bytes before the stamp of a message with a header: kind of the encoding, or in ROS 1 a number.
+# Bytes before the stamp of a message with a header: they name the encoding, or hold a number in
+# ROS 1. [derived: CDR, and std_msgs/Header of ROS 1]
 _BEFORE_STAMP = 4
-# Stamp of a header: seconds and nanoseconds.
+# A stamp has seconds and nanoseconds. [derived: builtin_interfaces/Time]
 _STAMP = struct.Struct('<iI')
-# The same in the other byte order, which the second byte of CDR names.
+# A stamp in the other byte order, which the second byte of CDR names. [derived: CDR]
 _BIG_STAMP = struct.Struct('>iI')
 
 
@@ -520,7 +513,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     path = Path(path)
     with ExitStack() as stack:
         try:
-            bag = Bag(path, open_files(path, stack))
+            bag = Bag(path, stack)
         except PermissionError as error:
             raise InputError(f'{path} cannot be read: {error.strerror}') from error
         yield bag

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 import os
 from pathlib import Path
 import struct
@@ -28,25 +29,30 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # First bytes of a file. [derived: the format of ROS 1 bags, version 2.0]
 _MAGIC = b'#ROSBAG V2.0\n'
-# Kinds of records. [derived: the format, as the layouts below]
+# All kinds and layouts of records are [derived: the format of ROS 1 bags, version 2.0].
+# A message lies in a chunk.
 _MESSAGE = 2
+# A chunk holds compressed records.
 _CHUNK = 5
+# An entry of the index says where a chunk lies.
 _CHUNK_INFO = 6
-_CONNECTION = 7  # a topic of one publisher
-# Size of a record.
+# A connection is a topic of one publisher.
+_CONNECTION = 7
+# Numbers, and lengths of what follows.
 _LENGTH = struct.Struct('<I')
 # Place of a record in the file.
 _PLACE = struct.Struct('<Q')
-# Time: seconds and nanoseconds.
+# Time as seconds and nanoseconds.
 _TIME = struct.Struct('<II')
-_COUNT = struct.Struct('<II')  # connection, number of its messages in a chunk
+# Connection and the number of its messages in a chunk.
+_COUNT = struct.Struct('<II')
 # Bytes of the largest header of a record that is read. [chosen: that of a connection holds a
 # topic's name, the others less than 100 bytes]
 _MAX_HEADER = 1 << 16
 # Duration without an end in profiles of QoS. [derived: rosbag2]
 _FOREVER = QosTime(2147483647, 4294967295)
-# QoS in ROS 2 of a topic whose publisher has latched its last message, as `rosbags-convert` has
-# it.
+# QoS in ROS 2 of a topic whose publisher has latched its last message. [derived: `rosbags-convert`
+# writes the same]
 LATCHED = Qos(
     QosHistory.UNKNOWN,
     0,
@@ -63,35 +69,27 @@ LATCHED = Qos(
 class Ros1Storage:
     """An open ROS 1 bag; see `Storage`."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open('rb', buffering=0)
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        self._file = stack.enter_context(path.open('rb', buffering=0))
         self._chunks = KeptChunks(self._load_chunk)
         self._places: list[int] = []
         self._counts: Counter[int] = Counter()
         self.topics: list[StoredTopic] = []
         self.start_ns = self.end_ns = 0
-        try:
-            if self._read(0, len(_MAGIC)) != _MAGIC:
-                raise DamagedError('only version 2.0 of ROS 1 bags can be read')
-            fields, _, _ = self._record(len(_MAGIC))
-            (index,) = _PLACE.unpack(fields['index_pos'])
-            size = os.fstat(self._file.fileno()).st_size
-            # rosbag renames a file when it closes it.
-            if index == 0 or (index >= size and path.suffix == '.active'):
-                raise UnfinishedError(
-                    f'its recorder has not closed it: "rosbag reindex {path.name}" in ROS 1 does'
-                )
-            self._read_index(index, size)
-            counted = _LENGTH.unpack(fields['conn_count']), _LENGTH.unpack(fields['chunk_count'])
-            if counted != ((len(self.topics),), (len(self._places),)):
-                raise DamagedError('its index is not complete')
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        if self._read(0, len(_MAGIC)) != _MAGIC:
+            raise DamagedError('only version 2.0 of ROS 1 bags can be read')
+        fields, _, _ = self._record(len(_MAGIC))
+        (index,) = _PLACE.unpack(fields['index_pos'])
+        size = os.fstat(self._file.fileno()).st_size
+        # rosbag renames a file when it closes it.
+        if index == 0 or (index >= size and path.suffix == '.active'):
+            raise UnfinishedError(
+                f'its recorder has not closed it: "rosbag reindex {path.name}" in ROS 1 does'
+            )
+        self._read_index(index, size)
+        counted = _LENGTH.unpack(fields['conn_count']), _LENGTH.unpack(fields['chunk_count'])
+        if counted != ((len(self.topics),), (len(self._places),)):
+            raise DamagedError('its index is not complete')
 
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""
@@ -129,14 +127,15 @@ class Ros1Storage:
 
     def _read_index(self, start: int, end: int) -> None:
         """Read the connections and the places of the chunks, which stand at the end."""
-        connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
+        connections: dict[int, dict[str, bytes]] = {}
         times: list[int] = []
         while start < end:
             fields, data, size = self._record(start)
             start = data + size
             if fields['op'][0] == _CONNECTION:
-                content = _fields(self._read(data, size))
-                connections[_LENGTH.unpack(fields['conn'])[0]] = fields, content
+                (number,) = _LENGTH.unpack(fields['conn'])
+                # Both parts name the topic: that of the record counts, the other may be remapped.
+                connections[number] = {**_fields(self._read(data, size)), 'topic': fields['topic']}
             elif fields['op'][0] == _CHUNK_INFO:
                 self._places.append(_PLACE.unpack(fields['chunk_pos'])[0])
                 for connection, count in _COUNT.iter_unpack(self._read(data, size)):
@@ -144,20 +143,20 @@ class Ros1Storage:
                 times += [_nanoseconds(fields['start_time']), _nanoseconds(fields['end_time'])]
         self._places.sort()
         self.start_ns, self.end_ns = (min(times), max(times)) if times else (0, 0)
-        for number, (head, content) in connections.items():
-            package, _, name = content['type'].decode().rpartition('/')
-            self.topics.append(
-                StoredTopic(
-                    number,
-                    _normalised(head['topic'].decode()),
-                    f'{package}/msg/{name}',
-                    self._counts[number],
-                    'ros1',
-                    content['md5sum'].decode(),
-                    content['message_definition'].decode(errors='replace'),
-                    (LATCHED,) if content.get('latching') == b'1' else (),
-                )
-            )
+        self.topics = [self._topic(*connection) for connection in connections.items()]
+
+    def _topic(self, number: int, connection: dict[str, bytes]) -> StoredTopic:
+        package, _, name = connection['type'].decode().rpartition('/')
+        return StoredTopic(
+            number,
+            _normalised(connection['topic'].decode()),
+            f'{package}/msg/{name}',
+            self._counts[number],
+            'ros1',
+            connection['md5sum'].decode(),
+            connection['message_definition'].decode(errors='replace'),
+            (LATCHED,) if connection.get('latching') == b'1' else (),
+        )
 
     def _load_chunk(self, start: int) -> bytes:
         fields, data, size = self._record(start)

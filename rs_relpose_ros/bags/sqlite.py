@@ -1,49 +1,43 @@
 """Read the SQLite files of rosbag2, also those of a recorder that was killed."""
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, ExitStack
 from pathlib import Path
 import sqlite3
 from urllib.parse import quote
 
 from rs_relpose_ros.bags.storage import DamagedError, Entry, qos_profiles, StoredTopic
 
-# First bytes of a write-ahead log. SQLite takes a log that begins otherwise for an empty one.
+# First bytes of a write-ahead log, in both byte orders. SQLite takes a log that begins otherwise
+# for an empty one. [derived: its file format]
 _LOG_MAGIC = (0x377F0682, 0x377F0683)
 
 
 class SqliteStorage:
     """An open SQLite file; see `Storage`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, stack: ExitStack) -> None:
         # What a recorder has written last is in another file until it is closed.
         log = path.with_name(f'{path.name}-wal')
-        self._has_log = log.exists() and log.stat().st_size > 0
-        if self._has_log:
+        has_log = log.exists() and log.stat().st_size > 0
+        if has_log:
             with log.open('rb') as opened:
                 begin = int.from_bytes(opened.read(4), 'big')
             if begin not in _LOG_MAGIC:
                 raise DamagedError(f'its last messages are in {log.name}, which is damaged')
         # The user's file stays as it is. Without a log nothing is written beside it either.
-        mode = 'mode=ro' if self._has_log else 'mode=ro&immutable=1'
-        self._base = sqlite3.connect(f'file:{quote(str(path.absolute()))}?{mode}', uri=True)
+        mode = 'mode=ro' if has_log else 'mode=ro&immutable=1'
+        base = sqlite3.connect(f'file:{quote(str(path.absolute()))}?{mode}', uri=True)
+        self._base = stack.enter_context(closing(base))
         try:
             self._read_topics()
         except sqlite3.Error as error:
-            self.close()
-            if self._has_log:
+            if has_log:
                 raise DamagedError(
                     f'its last messages are in {log.name}, which cannot be read ({error}): copy '
                     'both files into a folder that can be written, and give the copy'
                 ) from error
             raise DamagedError(f'SQLite reports: {error}') from error
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Close the file."""
-        self._base.close()
 
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""
@@ -60,37 +54,31 @@ class SqliteStorage:
         return bytes(data)
 
     def _read_topics(self) -> None:
-        tables = {name for (name,) in self._base.execute('SELECT name FROM sqlite_master')}
+        query = self._base.execute
+        tables = {name for (name,) in query('SELECT name FROM sqlite_master')}
         if not {'topics', 'messages'} <= tables:
             raise DamagedError('it has no tables of rosbag2')
-        counts = dict(
-            self._base.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id')
-        )
+        counts = dict(query('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
         definitions = {}
         if 'message_definitions' in tables:
             definitions = dict(
-                self._base.execute(
-                    'SELECT topic_type, encoded_message_definition FROM message_definitions'
-                )
+                query('SELECT topic_type, encoded_message_definition FROM message_definitions')
             )
-        rows = self._base.execute('SELECT * FROM topics')
+        rows = query('SELECT * FROM topics')
         names = [column[0] for column in rows.description]
         self.topics = []
         for row in rows:
             found = dict(zip(names, row, strict=True))
-            self.topics.append(
-                StoredTopic(
-                    int(found['id']),
-                    str(found['name']),
-                    str(found['type']),
-                    int(counts.get(found['id'], 0)),
-                    str(found['serialization_format']),
-                    str(found.get('type_description_hash') or ''),
-                    str(definitions.get(found['type'], '')),
-                    qos_profiles(str(found.get('offered_qos_profiles') or '')),
-                )
+            topic = StoredTopic(
+                int(found['id']),
+                str(found['name']),
+                str(found['type']),
+                int(counts.get(found['id'], 0)),
+                str(found['serialization_format']),
+                str(found.get('type_description_hash') or ''),
+                str(definitions.get(found['type'], '')),
+                qos_profiles(str(found.get('offered_qos_profiles') or '')),
             )
-        times = self._base.execute(
-            'SELECT min(timestamp), max(timestamp) FROM messages'
-        ).fetchone()
+            self.topics.append(topic)
+        times = query('SELECT min(timestamp), max(timestamp) FROM messages').fetchone()
         self.start_ns, self.end_ns = (int(time or 0) for time in times)

@@ -43,7 +43,8 @@ MAX_MESSAGE_BYTES = 1 << 29
 # chunks again where topics lie far apart in the file; more only take memory. [chosen: 10 to 500
 # MB]
 _KEPT_BYTES = 1 << 27
-# First bytes of compressed data (zstd); a message as CDR begins with a zero.
+# First bytes of data that are compressed by zstd. A message as CDR begins with a zero instead.
+# [derived: the format of zstd]
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 # Size of the largest text of QoS profiles that is parsed. [chosen: a profile has 300 bytes, and a
 # topic one for each publisher]
@@ -82,7 +83,10 @@ class Entry(NamedTuple):
 
 
 class Storage(Protocol):
-    """An open file of a bag. Damage raises a DamagedError, or any error of a parser."""
+    """An open file of a bag, closed by the stack that its class gets with the path.
+
+    Damage raises a DamagedError, or any error of a parser.
+    """
 
     topics: list[StoredTopic]
     start_ns: int  # first and last time of recording; both 0 without messages
@@ -93,9 +97,6 @@ class Storage(Protocol):
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""
-
-    def close(self) -> None:
-        """Close the file."""
 
 
 def decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:
@@ -110,6 +111,7 @@ def decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> by
     return out
 
 
+# Compressions of chunks by the names that recorders write. [derived: rosbag2 and ROS 1]
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
     'zstd': zstd.ZstdDecompressor,
     'lz4': LZ4FrameDecompressor,

@@ -13,7 +13,8 @@ from rs_relpose_ros.bags.reader import RawMessage, Topic
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.output_files import beside, refuse_existing
 
-# Of an unknown type in a bag without hashes: players use its name.
+# Hash of an unknown type in a bag without hashes: players use the name of the type. [chosen: any
+# hash that no type has]
 _UNKNOWN_HASH = f'RIHS01_{64 * "0"}'
 
 
@@ -33,7 +34,6 @@ class BagWriter:
 
     @contextmanager
     def _opened(self) -> Iterator[None]:
-        refuse_existing(self.path)
         with beside(self.path) as part:
             with Writer(part, version=9, storage_plugin=StoragePlugin.MCAP) as self._writer:
                 yield
@@ -71,11 +71,12 @@ class BagWriter:
 
     def announce(self, topic: Topic, origin: dict[str, Any]) -> None:
         """Announce a topic whose messages are copied or replaced; `origin` is that of `Bag`."""
-        origin = {'msgdef': '', **origin, 'rihs01': origin.get('rihs01') or _UNKNOWN_HASH}
+        described = {**origin, 'rihs01': origin.get('rihs01') or _UNKNOWN_HASH}
         if topic.msgtype in self._typestore.fielddefs and not origin['msgdef']:
-            del origin['msgdef'], origin['rihs01']
+            # rosbags writes the definition and the hash of a type that it knows.
+            del described['msgdef'], described['rihs01']
         connection = self._writer.add_connection(
-            topic.name, topic.msgtype, typestore=self._typestore, **origin
+            topic.name, topic.msgtype, typestore=self._typestore, **described
         )
         self._copied[topic.name, topic.msgtype] = connection
         self._connections.setdefault(topic.name, connection)
