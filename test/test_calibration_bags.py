@@ -16,7 +16,7 @@ import yaml
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_ros.calibrate import procedure
-from rs_relpose_ros.calibration.observations import GyroSeries, Tracks
+from rs_relpose_ros.calibration.observations import GyroSeries, TrackedPoints
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig
@@ -190,12 +190,12 @@ def gyro_of(path: Path) -> GyroSeries:
     )
 
 
-def corners_of(path: Path, frames: slice) -> Tracks:
+def corners_of(path: Path, frames: slice) -> TrackedPoints:
     with tarfile.open(path) as archive:
         names = sorted(name for name in archive.getnames() if name.endswith('.csv'))[frames]
         lines = [archive.extractfile(name).read().decode().split()[1:] for name in names]
     values = np.loadtxt([line for of_frame in lines for line in of_frame], delimiter=',')
-    return Tracks(
+    return TrackedPoints(
         np.array([int(Path(name).stem) for name in names]),
         np.repeat(np.arange(len(names)), [len(of_frame) for of_frame in lines]),
         (4 * values[:, 10] + values[:, 11]).astype(np.int64),

@@ -14,7 +14,7 @@ from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_ta
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.procedure import CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate
-from rs_relpose_ros.calibration.observations import Tracks
+from rs_relpose_ros.calibration.observations import TrackedPoints
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
 from rs_relpose_ros.errors import InputError
 
@@ -48,7 +48,7 @@ class Part:
     focal: float  # that was assumed [px]
 
 
-def parts_of(tracks: Tracks, seconds: float) -> Iterator[tuple[float, Tracks]]:
+def parts_of(tracks: TrackedPoints, seconds: float) -> Iterator[tuple[float, TrackedPoints]]:
     """Whole parts of so many seconds, with their begin [s]; all of it where it is shorter."""
     times = (tracks.stamps_ns - tracks.stamps_ns[0]) * 1e-9
     for k in range(max(int(times[-1] / seconds + 1e-6), 1)):
@@ -60,7 +60,7 @@ def parts_of(tracks: Tracks, seconds: float) -> Iterator[tuple[float, Tracks]]:
         kept = (tracks.frames >= first) & (tracks.frames <= last)
         yield (
             begin,
-            Tracks(
+            TrackedPoints(
                 tracks.stamps_ns[inside],
                 tracks.frames[kept] - first,
                 tracks.ids[kept],

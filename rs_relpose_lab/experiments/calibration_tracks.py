@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.trajectory import FinePath, Trajectory
-from rs_relpose_ros.calibration.observations import axis_maps, GyroSeries, Tracks
+from rs_relpose_ros.calibration.observations import axis_maps, GyroSeries, TrackedPoints
 from rs_relpose_ros.geometry import Array
 
 START_NS = 1_700_000_000_000_000_000
@@ -86,7 +86,7 @@ def about_one_axis(axis: int, duration: float) -> Trajectory:
 class Recorded:
     """Input of `calibrate`, and the truth."""
 
-    tracks: Tracks
+    tracks: TrackedPoints
     gyro: GyroSeries
     truth: Truth
     trajectory: Trajectory
@@ -116,7 +116,9 @@ def record(
     if truth.stamp_jitter:
         offsets = offsets + truth.stamp_jitter * rng.standard_normal(truth.frames)
     stamps = START_NS + np.rint((times - offsets) * 1e9).astype(np.int64)
-    return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
+    return Recorded(
+        TrackedPoints(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory
+    )
 
 
 def _gyro(

@@ -16,16 +16,22 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
-from rs_relpose_ros.calibration import fit, model, observations
+from rs_relpose_ros.calibration import errors, fit, model, observations
 from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.calibration.findings_text import with_sigma
-from rs_relpose_ros.calibration.observations import GyroSeries, Observations, PairSelection, Tracks
+from rs_relpose_ros.calibration.observations import (
+    GyroSeries,
+    Observations,
+    PairSelection,
+    TrackedPoints,
+)
 from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
+from rs_relpose_ros.core.deviations import OFFLINE
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
-from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
+from rs_relpose_ros.geometry.lens import DISTORTION_MODELS, N_LENS
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
@@ -42,14 +48,18 @@ _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
 # Changes of the lens within which the fit is linear in it, and fits at the most.
-_LENS_STAYS, _LENS_ROUNDS = (0.01, 0.02, 5.0, 5.0), 6
+_LENS_STAYS = (0.01, 0.01, 0.02, 0.02, 0.02, 5.0, 5.0)
+_LENS_ROUNDS = 6
+# Places of the parameters of an unknown lens.
+_LENS = OFFLINE.mask('focal_log', 'principal_point')
+_LENS[model.RADIAL] = True
 # Sigma of an angle that is not known [rad].
 _ANY_ANGLE = math.pi / math.sqrt(3.0)
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
 def calibrate(
-    tracks: Tracks,
+    tracks: TrackedPoints,
     gyro: GyroSeries,
     camera: RollingShutterCamera,
     *,
@@ -98,12 +108,11 @@ def _calibrated(
 
     `about` gives the observations with a deviation of the lens.
     """
-    data = about(np.zeros(len(model.LENS_BASIS.T)))
-    free = np.ones(model.GLOBAL, dtype=bool)
-    free[[model.SLOPE, model.EXPOSURE]] = free[model.LENS] = False
+    data = about(np.zeros(N_LENS))
+    free = OFFLINE.mask('axes', 'time_offset', 'readout_time', 'gyro_bias')
     free[model.FOCAL] = not focal_known
     data, coarse = _coarse_fit(about, data, free, R_prior, config, rng)
-    free[model.LENS] = not focal_known
+    free[_LENS] = not focal_known
     if not focal_known:
         data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, rng)
         coarse = settled.unknowns
@@ -112,10 +121,10 @@ def _calibrated(
     free[model.EXPOSURE] = data.exposure.square_sigma > 0.0
     data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
     progress(0.7)
-    errors = None
+    doubts = None
     if config.exposed:
-        errors = fit.ModelErrors() if focal_known else fit.ESTIMATED_LENS
-    final = fit.widened(final, errors)
+        doubts = errors.doubts(data.camera.width, lens_known=focal_known)
+    final = errors.widened(final, doubts)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
     curve = fit.cost_curve(
@@ -132,7 +141,7 @@ def warm_up_fit() -> None:
     """Compile (or load from the cache) the kernels of a calibration, on made-up points."""
     frames, points, rng = 60, 30, np.random.default_rng(0)
     stamps_ns = np.arange(frames) * to_nanoseconds(1.0 / 30.0)
-    tracks = Tracks(
+    tracks = TrackedPoints(
         stamps_ns,
         np.repeat(np.arange(frames), points),
         np.tile(np.arange(points), frames),
@@ -146,28 +155,28 @@ def warm_up_fit() -> None:
     data.image_rates(data.pairs(_NEIGHBOURS, rng))
     problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
     begin = fit.initial(problem, np.eye(3), 0.0)
-    fit.fit(fit.with_bends(problem, begin), begin, np.ones(model.GLOBAL, dtype=bool), rounds=1)
+    every = np.ones(model.GLOBAL, dtype=bool)
+    errors.fit(fit.with_bends(problem, begin), begin, every, rounds=1)
 
 
 def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tuple[fit.Fit, bool]:
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
-    R, part = final.unknowns.R_imu_cam, model.ROTATION
+    R, part = final.unknowns.R_cam_imu, model.ROTATION
     covariance = final.covariance.copy()
-    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS], R.T)
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS], R)
     if one_axis:  # about which the fit means nothing
         covariance[part] -= np.outer(axis, axis @ covariance[part])
         covariance[:, part] -= np.outer(covariance[:, part] @ axis, axis)
         covariance[part, part] += _ANY_ANGLE**2 * np.outer(axis, axis)
-    turn = log_so3(R_prior @ R)
+    turn = log_so3(np.ascontiguousarray(R_prior @ R.T))
     # As `angle_between`, axis by axis.
-    if (
-        turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part], turn)
-        > 1.0
-    ):
+    of_prior = AXES_SIGMA**2 * np.eye(3)
+    if turn @ np.linalg.solve(of_prior + 9.0 * covariance[part, part], turn) > 1.0:
         return final, False
-    unknowns, covariance = joined(final.unknowns, covariance, part, turn, AXES_SIGMA**2)
+    places = np.arange(model.GLOBAL)[part]
+    unknowns, covariance = joined(final.unknowns, covariance, places, turn, of_prior)
     return replace(final, unknowns=unknowns, covariance=covariance), True
 
 
@@ -242,10 +251,11 @@ def _coarse_fit(
         raise InputError('the gyro does not cover the images: record both together')
     fits = []
     for start in starts:
-        data = about(np.array([np.log(start.focal_factor), 0.0, 0.0, 0.0]))
+        data = about(np.log(start.focal_factor) * np.eye(N_LENS)[0])
         problem = data.selected_problem(_PAIRS_AT_START, start.offset, rng)
-        unknowns = fit.initial(problem, start.R_cam_imu.T, start.offset)
-        fits.append((data, fit.fit(problem, unknowns, free, rounds=20, tolerance=0.3).unknowns))
+        unknowns = fit.initial(problem, start.R_cam_imu, start.offset)
+        coarse = fit.minimised(problem, unknowns, free, rounds=20, tolerance=0.3)
+        fits.append((data, coarse.unknowns))
     # By the noise of the matches: pairs and cost differ between the starts.
     return min(fits, key=lambda found: float(np.median(found[1].noise)))
 
@@ -270,7 +280,7 @@ def _fit_with_lens(
             begin = coarse._replace(parameters=parameters)
         else:
             begin = fit.restarted(problem, coarse, 2.0)
-        found = fit.fit(fit.with_bends(problem, begin), begin, free)
+        found = errors.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
         if (np.abs(coarse.parameters[model.LENS]) <= _LENS_STAYS).all():
             break
@@ -319,10 +329,10 @@ def evaluated(
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
     unknowns, covariance = _with_common_errors(final, config)
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
-    parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
+    parameters, R_cam_imu = bounded.parameters, bounded.R_cam_imu
     rates, one_axis, _ = data.excitation(parameters[model.BIAS], R_cam_imu)
     sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
-    if fit.move_of_poses(final, covariance) <= 1.0:
+    if errors.move_of_poses(final, covariance) <= 1.0:
         wide = max(wide, config.unnoticed_tolerance)
     axis_map = observations.nearest_axis_map(R_cam_imu)
 
@@ -375,9 +385,10 @@ def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[mode
     if not final.free[model.FOCAL]:
         return unknowns, covariance
     # Widened, the sigmas of the lens may exceed the sigmas of its priors.
-    known = slice(model.RADIAL, model.EXPOSURE)
-    center, variances = final.problem.center[known], 1.0 / final.problem.prior[known]
-    return joined(unknowns, covariance, known, center, variances)
+    prior = final.problem.prior
+    known = np.flatnonzero(_LENS & (np.diag(prior) > 0.0))
+    of_prior = np.asarray(np.linalg.inv(prior[np.ix_(known, known)]), dtype=np.float64)
+    return joined(unknowns, covariance, known, final.problem.center[known], of_prior)
 
 
 def _offset_of_row_0(
@@ -403,8 +414,9 @@ def _lens(
     data: Observations, parameters: Array, sigmas: Array, wide: float, one_axis: str
 ) -> LensEstimates:
     """Estimates of the lens; the focal length is not observable by a rotation about one axis."""
-    camera = data.camera.moved_lens(model.LENS_BASIS @ parameters[model.LENS])
-    focal_sigma, radial_sigma, column_sigma, row_sigma = map(float, sigmas[model.LENS])
+    camera = data.camera.moved_lens(parameters[model.LENS])
+    focal_sigma, radial_sigma = float(sigmas[model.FOCAL]), float(sigmas[model.RADIAL])
+    column_sigma, row_sigma = map(float, sigmas[model.CENTER])
     factor = math.exp(data.lens[0] + parameters[model.FOCAL])
     most = factor * wide * _MOST[model.FOCAL]
     return LensEstimates(
@@ -428,13 +440,16 @@ def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estima
 def joined(
     unknowns: model.Unknowns,
     covariance: Array,
-    known: slice,
-    values: Array | float,
-    variances: Array | float,
+    known: NDArray[np.int64],
+    values: Array,
+    of_values: Array,
 ) -> tuple[model.Unknowns, Array]:
-    """The calibration with independent values of some parameters, and its covariance."""
-    own = covariance[known, known]
-    gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
+    """The calibration with independent values of the parameters `known` (m,), and its covariance.
+
+    `of_values` (m, m) is the covariance of the `values` (m,).
+    """
+    own = covariance[np.ix_(known, known)]
+    gain = covariance[:, known] @ np.linalg.inv(own + of_values)
     step = gain @ (values - unknowns.parameters[known])
     return fit.stepped(unknowns, step), covariance - gain @ covariance[known]
 
@@ -451,7 +466,13 @@ def _bounded(
     k, known = model.READOUT, interval / math.sqrt(12.0)
     if covariance[k, k] > known**2:
         return (
-            *joined(unknowns, covariance, slice(k, k + 1), 0.5 * interval, known**2),
+            *joined(
+                unknowns,
+                covariance,
+                np.array([k]),
+                np.array([0.5 * interval]),
+                np.array([[known**2]]),
+            ),
             (
                 'the images hardly determine the readout time: it is mostly that of any camera '
                 f'that is read downwards within the {1e3 * interval:.1f} ms between frames'
@@ -513,7 +534,7 @@ _logger = logging.getLogger(__name__)
 class CalibrationInput:
     """Tracks (pixels of the full sensor), gyro and camera of a bag."""
 
-    tracks: Tracks
+    tracks: TrackedPoints
     gyro: GyroSeries
     camera: RollingShutterCamera  # of the full sensor, its readout time 0
     focal_known: bool  # by the CameraInfo; else `camera` is a guess
@@ -679,7 +700,7 @@ class Recorder:
         if intrinsics is not None:
             points = intrinsics.to_sensor(points)
         frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))
-        tracks = Tracks(np.array(of_frames), frames, np.concatenate(ids), points)
+        tracks = TrackedPoints(np.array(of_frames), frames, np.concatenate(ids), points)
         gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
         width, height = self.size
         if intrinsics is None:

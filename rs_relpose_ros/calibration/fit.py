@@ -1,96 +1,68 @@
-"""Robust fit of the calibration (Levenberg-Marquardt, pairs eliminated), and its sigmas.
+"""Robust fit of the calibration: Levenberg-Marquardt, the unknowns of the pairs eliminated.
 
-Steps 2 to 4 of docs/calibration.md, "Method": noise of matches by a jackknife over stretches of
-time; errors that regions of the image share (two-way clustering: A. C. Cameron, J. B. Gelbach,
-D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the recording do not share
-(R. T. Birge, Phys. Rev. 40, 1932); errors of the models of lens and gyro (`ModelErrors`).
+Step 2 of docs/calibration.md, "Method". What the sigmas contain beyond the noise of the matches is
+in `calibration.errors`.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special  # scipy.stats takes seconds to import, at the start of a node
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import model
-from rs_relpose_ros.calibration.model import (
-    GLOBAL,
-    LOCAL,
-    Problem,
-    READOUT,
-    ROTATION,
-    Unknowns,
+from rs_relpose_ros.calibration.model import GLOBAL, LOCAL, Problem, READOUT, ROTATION, Unknowns
+from rs_relpose_ros.core.least_squares import (
+    damped_step,
+    factor_groups,
+    solve_lower_groups,
+    solve_upper_groups,
 )
 from rs_relpose_ros.core.losses import geman_mcclure_weight, robust_scale
+from rs_relpose_ros.core.rows import gyro_matrix, turned_path, TurnedPath
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.gyro import GyroPath
-from rs_relpose_ros.geometry.so3 import log_so3
 
-# Stretches of a second, within which errors may be correlated, and limits of their number.
-_STRETCH = 1.0
-_LEAST_STRETCHES, _MOST_STRETCHES = 10, 30
+Flags = NDArray[np.bool_]
 
 
-def stretches(times: Array) -> NDArray[np.int64]:
-    """Stretch (P,) of the recording that each time (P,) [s] belongs to."""
-    begin, duration = times.min(), max(float(np.ptp(times)), 1e-9)
-    count = int(np.clip(duration / _STRETCH, _LEAST_STRETCHES, _MOST_STRETCHES))
-    return np.minimum(((times - begin) / duration * count).astype(np.int64), count - 1)
+def block_of(free: Flags) -> tuple[NDArray[np.int64], ...]:
+    """Index of some of the parameters in a matrix of all."""
+    places = np.flatnonzero(free)
+    return np.ix_(places, places)
 
 
-def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior: Array) -> Array:
-    """Covariance (G, G) by deleting a group each: one Newton step from the optimum.
+# -- Unknowns -------------------------------------------------------------------------------------
 
-    Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the few
-    groups (B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). `scores`
-    (P, G): gradients of the cost by pair; `curvatures` (P, G, G): their derivatives; `prior` (G,):
-    inverse variances that count as known.
-    """
-    total = curvatures.sum(axis=0) + np.diag(prior)
-    moves = np.stack(
-        [
-            np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
-            @ scores[groups == name].sum(axis=0)
-            for name in np.unique(groups)
-        ]
-    )
-    inverse = np.linalg.pinv(total, hermitian=True)
-    return jackknife_of(moves) + inverse @ np.diag(prior) @ inverse
-
-
-def jackknife_of(moves: Array) -> Array:
-    """Covariance (G, G) from the moves (K, G) of the optimum without each of K groups."""
-    count = len(moves)
-    moves = moves - moves.mean(axis=0)
-    # The scatter of few groups is uncertain, so that errors in sigmas follow Student's t: widened,
-    # one sigma has the coverage of a normal deviate.
-    wider = special.stdtrit(count - 1, special.ndtr(1.0)) ** 2
-    return np.asarray(wider * (count - 1) / count * moves.T @ moves)
-
-
-# Change of the camera's velocity during half a frame, over the depth of the scene [1/s]:
-# 2 m/s^2 for 15 ms at 3 m. Over the parallax per second it is `bend`, within these limits.
-_BEND, _BEND_RANGE = 0.01, (0.03, 0.5)
-# Scatter of a match before the fit [px], and at the least.
-_NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
+# Scatter of a match before the fit [px]. A smaller one takes the matches of a coarse start for
+# outliers. [chosen: a start is off by a few pixels; the fit estimates the noise itself]
+_NOISE_AT_START = 5.0
+# Candidates of the direction of a pair. Fewer miss the best one in pairs with outliers, more cost
+# time in each search. [chosen: one in two of the matches right, all candidates are wrong with a
+# probability of 3e-8]
 _HYPOTHESES = 60
-# Newton's step [sigma] below which the optimum is near; its largest multiple that is taken.
-_NEAR, _MOST_GAIN = 2.0, 8.0
-# Levenberg-Marquardt's damping of the pairs' own unknowns stays in this range.
-_DAMPING = (1e-6, 1e3)
-# Range of the noise of a pair, relative to the median over all pairs.
-_NOISE_RANGE = (0.6, 4.0)
+# Least damping of the pairs' own unknowns. A larger one slows down the last steps.
+# [chosen: any value in 1e-9..1e-4 would do]
+_LEAST_DAMPING = 1e-6
+# Largest damping of the pairs' own unknowns. Beyond it, steps are too short to matter.
+# [chosen: any value in 1e2..1e6 would do]
+_MOST_DAMPING = 1e3
+# Cosine of the angle by which a direction must change before bend and turn of its pair start from
+# zero. [chosen: 2.6 deg, more than the noise of a direction]
+_SAME_DIRECTION = 0.999
+# Longest step of a direction along a tangent, about a right angle: matches may not determine a
+# step, and a longer one would return near its start. [derived: the tangent of 45 deg]
+_LONGEST_TURN = 1.0
+_STAY = np.zeros((1, LOCAL))
 
 
 def initial(
     problem: Problem,
-    R_imu_cam: Array,
+    R_cam_imu: Array,
     offset: float,
     readout: float = 0.0,
     bias: Array | float = 0.0,
@@ -98,49 +70,38 @@ def initial(
 ) -> Unknowns:
     """A calibration with the assumed lens, and the most likely directions of the pairs."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
-    parameters[[READOUT, model.OFFSET]] = readout, offset
+    parameters[READOUT] = readout
+    parameters[model.OFFSET] = offset
     parameters[model.BIAS] = bias
-    # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
-    return redirected(
-        problem,
-        Unknowns(
-            parameters,
-            np.ascontiguousarray(R_imu_cam),
-            np.tile(np.eye(9)[0], (pairs, 1)),
-            np.full(pairs, noise),
-            np.full(pairs, _DAMPING[0]),
-        ),
+    begin = Unknowns(
+        parameters,
+        # A transposed matrix would have the kernels compiled a second time.
+        np.ascontiguousarray(R_cam_imu),
+        np.tile(np.eye(9)[0], (pairs, 1)),
+        np.full(pairs, noise),
+        np.full(pairs, _LEAST_DAMPING),
     )
+    return redirected(problem, begin)
 
 
 def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unknowns:
     """The calibration for other pairs, about its own lens, with a multiple of its median noise."""
     p = unknowns.parameters
-    return initial(
-        problem,
-        unknowns.R_imu_cam,
-        p[model.OFFSET],
-        p[READOUT],
-        p[model.BIAS],
-        caution * float(np.median(unknowns.noise)),
-    )
-
-
-_STAY = np.zeros((1, LOCAL))
+    noise = caution * float(np.median(unknowns.noise))
+    return initial(problem, unknowns.R_cam_imu, p[model.OFFSET], p[READOUT], p[model.BIAS], noise)
 
 
 def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
     parameters[ROTATION] = 0.0
-    back = Rotation.from_rotvec(-step[ROTATION]).as_matrix()
-    # At most about a right angle: matches may not determine a step.
-    along = np.clip(local[:, :2], -1.0, 1.0)
+    turn = Rotation.from_rotvec(step[ROTATION]).as_matrix()
+    along = np.clip(local[:, :2], -_LONGEST_TURN, _LONGEST_TURN)
     direction = unknowns.own[:, :3] + np.einsum('pk,pki->pi', along, _tangents(unknowns))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return unknowns._replace(
         parameters=parameters,
-        R_imu_cam=unknowns.R_imu_cam @ back,
+        R_cam_imu=turn @ unknowns.R_cam_imu,
         own=np.hstack([direction, unknowns.own[:, 3:] + local[:, 2:]]),
     )
 
@@ -154,118 +115,14 @@ def _tangents(unknowns: Unknowns) -> Array:
     return np.stack([first, np.cross(directions, first)], axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Evaluation:
-    """Cost of all pairs, and, if requested, their normal equations without their own unknowns."""
-
-    losses: Array  # (P,) robust losses of the matches and the prior of the pair
-    residuals: Array  # (N,) [px]
-    score: Array  # (P, GLOBAL) gradient by the parameters
-    reduced: Array  # (P, GLOBAL, GLOBAL) Hessian by the parameters
-    back: Array  # (P, LOCAL, GLOBAL + 1) H_ll^-1 [H_lg, g_l]
-
-    @property
-    def cost(self) -> float:
-        """Sum over the pairs."""
-        return float(self.losses.sum())
-
-    def local_step(self, step: Array) -> Array:
-        """Step (P, LOCAL) of the pairs' own unknowns for a step of the parameters."""
-        return np.asarray(-self.back[:, :, GLOBAL] - self.back[:, :, :GLOBAL] @ step)
-
-
 def redirected(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """Unknowns with the best direction of each pair among many that two of its matches fix."""
     moved = unknowns._replace(own=unknowns.own.copy())
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
     model.find_directions(_through_lens(problem, moved), _path(problem, moved), moved, chosen)
     cosines = (moved.own[:, :3] * unknowns.own[:, :3]).sum(axis=1)
-    moved.own[np.abs(cosines) < 0.999, 3:] = 0.0
+    moved.own[np.abs(cosines) < _SAME_DIRECTION, 3:] = 0.0
     return moved
-
-
-def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> Evaluation:
-    """Residuals and, with `derivatives`, the normal equations at `unknowns`."""
-    return _evaluation(problem, unknowns, _sums(problem, unknowns, derivatives))
-
-
-def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums:
-    size = problem.pairs if derivatives else 0
-    sums = model.Sums(
-        np.empty(problem.pairs),
-        np.empty(len(problem.rows[0])),
-        np.zeros((size, model.ALL)),
-        np.zeros((size, model.ALL, model.ALL)),
-    )
-    path = _path(problem, unknowns)
-    turned = cumulative_trapezoid(path.rotations, path.times, axis=0, initial=0.0)
-    model.accumulate(
-        _through_lens(problem, unknowns),
-        path,
-        turned,
-        unknowns,
-        _tangents(unknowns),
-        derivatives,
-        sums,
-    )
-    return sums
-
-
-def _evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evaluation:
-    """Add the priors of the pairs' own unknowns, and eliminate these."""
-    size, weights = len(sums.gradient), _local_priors(problem)
-    own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.own[:, 3:]])
-    result = Evaluation(
-        sums.losses + 0.5 * (weights * own**2).sum(axis=1),
-        sums.residuals,
-        np.empty((size, GLOBAL)),
-        np.empty((size, GLOBAL, GLOBAL)),
-        np.empty((size, LOCAL, GLOBAL + 1)),
-    )
-    if size:
-        gradient = sums.gradient.copy()
-        gradient[:, GLOBAL:] += weights * own
-        model.eliminate(
-            sums._replace(gradient=gradient),
-            weights,
-            unknowns.damping,
-            result.score,
-            result.reduced,
-            result.back,
-        )
-    return result
-
-
-def _local_priors(problem: Problem) -> Array:
-    """Inverse variances (P, LOCAL); the 1 keeps a direction that no match determines."""
-    return np.ascontiguousarray(
-        np.repeat(
-            [np.ones(problem.pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
-            [2, 3, 3],
-            axis=0,
-        ).T
-    )
-
-
-def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
-    """Problem with priors of `bend` from the parallax per second of the matches."""
-    path, parameters = _path(problem, unknowns), unknowns.parameters
-    rays = []
-    for times, rows, points in zip(
-        problem.times, problem.rows, _through_lens(problem, unknowns).points, strict=True
-    ):
-        at = times[problem.pair] + parameters[model.OFFSET] + parameters[READOUT] * rows
-        directions = np.column_stack([points, np.ones(len(points))])
-        rays.append(
-            np.einsum(
-                'nij,nj->ni',
-                path.at(at) @ unknowns.R_imu_cam,
-                directions / np.linalg.norm(directions, axis=1)[:, None],
-            )
-        )
-    angles = _medians(problem, np.linalg.norm(np.cross(rays[0], rays[1]), axis=1))
-    passing = np.maximum(angles / (problem.times[1] - problem.times[0]), 1e-6)
-    return problem._replace(bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
 
 
 def _through_lens(problem: Problem, unknowns: Unknowns) -> Problem:
@@ -279,17 +136,281 @@ def _through_lens(problem: Problem, unknowns: Unknowns) -> Problem:
     )
 
 
-def _medians(problem: Problem, values: Array) -> Array:
-    """Median (P,) over the matches of each pair of values (N,)."""
-    return np.array(
-        [np.median(values[begin:end]) for begin, end in itertools.pairwise(problem.begin)]
+def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
+    """The integrated gyro in the axes of the camera."""
+    parameters = unknowns.parameters
+    exposed = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
+    true = (exposed - parameters[model.BIAS]) @ (np.eye(3) + gyro_matrix(parameters))
+    rates = true @ unknowns.R_cam_imu.T
+    return GyroPath.integrated(problem.gyro_times, np.ascontiguousarray(rates))
+
+
+# -- Prior of the bend of a pair ------------------------------------------------------------------
+
+# Change of the camera's velocity during half a frame, over the depth of the scene [1/s]. Over the
+# parallax per second it is the sigma of `bend`. [chosen: 2 m/s^2 for 15 ms at 3 m]
+_BEND = 0.01
+# Range of that sigma. Below it, a fast passage would hold the velocity constant; above it, a pair
+# nearly without parallax would have any. [chosen: from a tenth of a walk's to half of the motion]
+_BEND_RANGE = (0.03, 0.5)
+# Least parallax per second [rad/s] that the change is divided by. [chosen: below any that reaches
+# the upper end of the range, so that any value below 0.02 would do]
+_LEAST_PARALLAX = 1e-6
+
+
+def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
+    """Problem with priors of `bend` from the parallax per second of the matches."""
+    path, parameters = _path(problem, unknowns), unknowns.parameters
+    through = _through_lens(problem, unknowns)
+    rays = []
+    for times, rows, points in zip(problem.times, problem.rows, through.points, strict=True):
+        at = times[problem.pair] + parameters[model.OFFSET] + parameters[READOUT] * rows
+        directions = np.column_stack([points, np.ones(len(points))])
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        rays.append(np.einsum('nij,nj->ni', path.at(at), directions))
+    sines = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
+    angles = [np.median(sines[begin:end]) for begin, end in itertools.pairwise(problem.begin)]
+    passing = np.array(angles) / (problem.times[1] - problem.times[0])
+    bend = _BEND / np.maximum(passing, _LEAST_PARALLAX)
+    return problem._replace(bend_sigma=np.clip(bend, *_BEND_RANGE))
+
+
+# -- Cost and its derivatives ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """Cost of all pairs, and their normal equations for k parameters without their own unknowns.
+
+    Without derivatives, k is zero and all but the first two are empty.
+    """
+
+    losses: Array  # (P,) robust losses of the matches and the prior of the pair
+    residuals: Array  # (N,) [px]
+    score: Array  # (P, k) gradient by the parameters
+    reduced: Array  # (P, k, k) Hessian by the parameters
+    back: Array  # (k + 1, LOCAL, P) H_ll^-1 [H_lg, g_l]
+    own: Array  # (LOCAL, LOCAL, P) H_ll, lower triangles
+
+    @property
+    def cost(self) -> float:
+        """Sum over the pairs."""
+        return float(self.losses.sum())
+
+    def local_step(self, step: Array) -> Array:
+        """Step (P, LOCAL) of the pairs' own unknowns for a step (k,) of the parameters."""
+        by_parameters = np.einsum('k,klp->pl', step, self.back[:-1])
+        return np.asarray(-self.back[-1].T - by_parameters)
+
+
+# Turns of a path whose derivatives are not used.
+_NO_TURNS = np.zeros((0, 3, 1))
+
+
+def evaluate(problem: Problem, unknowns: Unknowns, free: Flags | None = None) -> Evaluation:
+    """Residuals at `unknowns`, and the normal equations of the `free` parameters (GLOBAL,)."""
+    return evaluation(problem, unknowns, sums_of(problem, unknowns, free))
+
+
+def sums_of(problem: Problem, unknowns: Unknowns, free: Flags | None) -> model.Sums:
+    """Sums over the matches of each pair, with derivatives by the `free` parameters (GLOBAL,)."""
+    columns = np.zeros(0, dtype=np.int64)
+    pairs = 0
+    if free is not None:
+        columns = np.concatenate([np.flatnonzero(free), np.arange(GLOBAL, model.ALL)])
+        pairs = problem.pairs
+    sums = model.Sums(
+        np.empty(problem.pairs),
+        np.empty(len(problem.rows[0])),
+        np.zeros((pairs, len(columns))),
+        np.zeros((pairs, len(columns), len(columns))),
+    )
+    path = _path(problem, unknowns)
+    if free is None:
+        turned = TurnedPath(path, _NO_TURNS, _NO_TURNS)
+    else:
+        turned = turned_path(path, unknowns.R_cam_imu, problem.blur_rates)
+    through = _through_lens(problem, unknowns)
+    model.accumulate(through, turned, unknowns, _tangents(unknowns), columns, sums)
+    return sums
+
+
+def evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evaluation:
+    """Add the priors of the pairs' own unknowns, and eliminate these.
+
+    With ``H_ll = L L^T``, diagonal times ``1 + damping``, and ``Y = L^-1 [H_lg, g_l]``:
+    ``score = g_g - Y_g^T y_l``, ``reduced = H_gg - Y_g^T Y_g``, ``back = L^-T Y``.
+    """
+    weights = _local_priors(problem)
+    own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.own[:, 3:]])
+    losses = sums.losses + 0.5 * (weights * own**2).sum(axis=1)
+    if not sums.gradient.size:
+        none = np.zeros((1, LOCAL, problem.pairs))
+        return Evaluation(losses, sums.residuals, none[:, 0], none, none, none)
+    k = sums.gradient.shape[1] - LOCAL
+    hessian = sums.hessian
+    of_own = np.ascontiguousarray(hessian[:, k:, k:].transpose(1, 2, 0))
+    diagonal = np.arange(LOCAL)
+    of_own[diagonal, diagonal] += weights.T
+    damped = of_own.copy()
+    damped[diagonal, diagonal] *= 1.0 + unknowns.damping
+    mixed = np.empty((k + 1, LOCAL, problem.pairs))
+    mixed[:k] = hessian[:, k:, :k].transpose(2, 1, 0)
+    mixed[k] = (sums.gradient[:, k:] + weights * own).T
+    factors, solved = np.zeros_like(damped), np.empty_like(mixed)
+    factor_groups(damped, factors)
+    for right, out in zip(mixed, solved, strict=True):
+        solve_lower_groups(factors, right, out)
+    by_pair = solved.transpose(2, 0, 1)
+    products = by_pair @ by_pair.transpose(0, 2, 1)
+    lower = hessian[:, :k, :k]
+    symmetric = lower + np.tril(lower, -1).transpose(0, 2, 1)
+    for values in solved:
+        solve_upper_groups(factors, values)
+    return Evaluation(
+        losses,
+        sums.residuals,
+        sums.gradient[:, :k] - products[:, :k, k],
+        symmetric - products[:, :k, :k],
+        solved,
+        of_own,
     )
 
 
-def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
-    parameters = unknowns.parameters
-    estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
-    return GyroPath.integrated(problem.gyro_times, estimated - parameters[model.BIAS])
+def _local_priors(problem: Problem) -> Array:
+    """Inverse variances (P, LOCAL); the 1 keeps a direction that no match determines."""
+    of_kinds = np.stack(
+        [np.ones(problem.pairs), problem.bend_sigma**-2, problem.turn_sigma**-2], axis=1
+    )
+    return np.repeat(of_kinds, [2, 3, 3], axis=1)
+
+
+# -- Steps ----------------------------------------------------------------------------------------
+
+# Damping of the parameters at the start, relative to the diagonal.
+# [chosen: small against 1, so that the first step is nearly Newton's]
+_FIRST_DAMPING = 1e-3
+# Least damping of the parameters. [chosen: above the rounding of the sums]
+_LEAST_OF_PARAMETERS = 1e-9
+# Factors of the damping after a step that lowers the cost, and after one that does not.
+# [chosen: Levenberg-Marquardt with the usual decade; any value in 3..30 would do]
+_LESS_DAMPING = 0.1
+_MORE_DAMPING = 10.0
+# Factor of the damping of a pair's own unknowns after a step that lowers its loss.
+# [chosen: slower than that of the parameters, as pairs alternate between two directions]
+_LESS_OF_PAIR = 0.2
+# Trials of a step, each with more damping, before the fit stays where it is.
+# [chosen: the last has a millionth of Newton's step]
+_TRIALS = 8
+# Newton's steps are extended at most by this factor: a larger one leaves the region where the
+# loss is convex. [chosen: weights of a robust loss make steps too short by up to four]
+_MOST_GAIN = 8.0
+# Least share of Newton's step that a step may be expected to leave. It limits the quotient that
+# extends steps. [chosen: any value below 1 / _MOST_GAIN would do]
+_LEAST_LEFT = 1e-3
+# Least square of a step [sigma^2] that a share is computed of: shorter ones are rounding.
+# [chosen: far below the tolerance of the fit]
+_LEAST_SQUARE = 1e-12
+
+
+class _Iterate(NamedTuple):
+    """State of the fit."""
+
+    unknowns: Unknowns
+    evaluation: Evaluation
+    newton: Array  # (k,) minus Newton's step to here
+    damping: float = _FIRST_DAMPING  # of the parameters
+    length: float = math.inf  # of `newton` [sigma]
+    gain: float = 1.0  # step taken, over `newton`
+
+
+def _begin(problem: Problem, unknowns: Unknowns, free: Flags) -> _Iterate:
+    """State before the first step."""
+    return _Iterate(unknowns, evaluate(problem, unknowns, free), np.zeros(int(free.sum())))
+
+
+def _prior_cost(problem: Problem, unknowns: Unknowns) -> float:
+    """Cost of the parameters by their prior."""
+    off = unknowns.parameters - problem.center
+    return 0.5 * float(off @ problem.prior @ off)
+
+
+def normal_equations(
+    problem: Problem, at: Evaluation, unknowns: Unknowns, free: Flags
+) -> tuple[Array, Array]:
+    """Hessian and gradient of the cost with its prior by the free parameters."""
+    H = at.reduced.sum(axis=0) + problem.prior[block_of(free)]
+    of_prior = problem.prior @ (unknowns.parameters - problem.center)
+    return H, at.score.sum(axis=0) + of_prior[free]
+
+
+def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns, float]:
+    """The calibration of `moved`, each pair with the better of its unknowns in both; the cost."""
+    stay = moved._replace(own=kept.own)
+    losses = evaluate(problem, moved).losses
+    others = evaluate(problem, stay).losses
+    better = losses <= others
+    damping = kept.damping * np.where(better, _LESS_OF_PAIR, _MORE_DAMPING)
+    unknowns = moved._replace(
+        own=np.where(better[:, None], moved.own, kept.own),
+        damping=np.clip(damping, _LEAST_DAMPING, _MOST_DAMPING),
+    )
+    return unknowns, float(np.minimum(losses, others).sum())
+
+
+def _step(problem: Problem, at: _Iterate, free: Flags) -> _Iterate:
+    """State after a step that lowers the cost; the same if none does."""
+    cost = at.evaluation.cost + _prior_cost(problem, at.unknowns)
+    H, gradient = normal_equations(problem, at.evaluation, at.unknowns, free)
+    newton = -damped_step(H, gradient, _LEAST_OF_PARAMETERS)[0]
+    length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
+    # The weights of a robust loss make Gauss-Newton steps too short, by the share that the last
+    # step left of itself: J. Barzilai, J. M. Borwein, Two-point step size gradient methods, 1988.
+    square = max(float(at.newton @ H @ at.newton), _LEAST_SQUARE)
+    left = float(newton @ H @ at.newton) / square
+    gain = min(max(at.gain / max(1.0 - left, _LEAST_LEFT), 1.0), _MOST_GAIN)
+    for _ in range(_TRIALS):
+        of_free = gain * damped_step(H, gradient, damping)[0]
+        step = np.zeros(GLOBAL)
+        step[free] = of_free
+        tried = stepped(at.unknowns, step, at.evaluation.local_step(of_free))
+        result = evaluate(problem, tried, free)
+        if result.cost + _prior_cost(problem, tried) > cost:
+            tried, tried_cost = _chosen(problem, tried, at.unknowns)
+            if tried_cost + _prior_cost(problem, tried) > cost:
+                gain, damping = 1.0, max(_MORE_DAMPING * damping, _FIRST_DAMPING)
+                continue
+            result = evaluate(problem, tried, free)
+        damping = max(_LESS_DAMPING * damping, _LEAST_OF_PARAMETERS)
+        return _Iterate(tried, result, newton, damping, length, gain)
+    return at._replace(damping=damping, length=length)
+
+
+# -- The fit --------------------------------------------------------------------------------------
+
+# Newton's step [sigma] below which the optimum is near and residuals are noise.
+# [chosen: any value in 1..5 would do]
+_NEAR = 2.0
+# Change of the logarithm of the median noise below which it is known.
+# [chosen: 3 % of a sigma]
+_NOISE_KNOWN = 0.03
+# Change beyond which directions are searched again. [chosen: below it, directions are the same]
+_NOISE_CHANGED = 0.1
+# Least noise of a match [px]. It limits the weight of images without noise, as in simulations.
+# [chosen: below the noise of any tracker]
+_LEAST_NOISE = 0.05
+# Range of the noise of a pair, relative to the median over all pairs. A wider one lets a pair of
+# few matches dominate, a narrower one ignores blurred images.
+# [chosen: scatter of the estimate of 20 matches, and images twice as blurred]
+_NOISE_RANGE = (0.6, 4.0)
+# Unknowns of a pair that make its residuals smaller. [derived: two of the direction, and about one
+# of bend and turn, which their priors hold]
+_FITTED = 3.0
+# The noise becomes less by this factor at most in a round, since directions have to follow.
+# [chosen: any value in 2..5 would do]
+_MOST_LESS = 3.0
+# Steps of the pairs alone after a search of their directions. [chosen: a third changes nothing]
+_SETTLING_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,27 +419,39 @@ class Fit:
 
     problem: Problem
     unknowns: Unknowns
-    free: NDArray[np.bool_]  # (GLOBAL,) parameters that were fitted
+    free: Flags  # (GLOBAL,) parameters that were fitted, k of them
     weights: Array  # (N,) of the matches, 1 where the residual is 0
     covariance: Array  # (GLOBAL, GLOBAL), zero rows and columns where a parameter was held
-    information: Array  # (GLOBAL, GLOBAL) the Hessian, before any prior
+    evaluation: Evaluation  # at the optimum
     converged: bool
+    # (k,) minus Newton's step that was left, if it has not converged.
+    left: Array
+
+    @property
+    def information(self) -> Array:
+        """The Hessian (k, k) of the free parameters, without any prior."""
+        return np.asarray(self.evaluation.reduced.sum(axis=0))
+
+    @property
+    def block(self) -> tuple[NDArray[np.int64], ...]:
+        """Index of the free parameters in a matrix (GLOBAL, GLOBAL)."""
+        return block_of(self.free)
 
 
-def fit(
+def minimised(
     problem: Problem,
     unknowns: Unknowns,
-    free: NDArray[np.bool_],
+    free: Flags,
     *,
     rounds: int = 60,
     tolerance: float = 0.05,
 ) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and estimate the noise meanwhile.
 
-    Newton steps shorter than `tolerance` [sigma of the parameters] end the fit. After `rounds`
-    the sigmas contain what may be left to the optimum.
+    Newton steps shorter than `tolerance` [sigma of the parameters] end the fit, or the number of
+    `rounds`. The covariance is zero yet: `errors.fit`.
     """
-    at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros(int(free.sum())))
+    at = _begin(problem, unknowns, free)
     noise_known = converged = False
     for _ in range(rounds):
         at = _step(problem, at, free)
@@ -330,32 +463,57 @@ def fit(
             continue
         noise = _estimated_noise(problem, at)
         change = float(np.median(np.abs(np.log(noise / at.unknowns.noise))))
-        noise_known = change < 0.03
+        noise_known = change < _NOISE_KNOWN
         unknowns = at.unknowns._replace(noise=noise)
-        if change > 0.1:
+        if change > _NOISE_CHANGED:
             # The cost is not convex in the directions: less noise distinguishes more of them.
-            unknowns = _chosen(
-                problem,
-                _settled(problem, redirected(problem, unknowns)),
-                _settled(problem, unknowns),
-            )[0]
-        at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton), at.damping)
+            searched = _settled(problem, redirected(problem, unknowns))
+            unknowns = _chosen(problem, searched, _settled(problem, unknowns))[0]
+        at = _begin(problem, unknowns, free)._replace(damping=at.damping)
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
-    evaluation = evaluate(problem, unknowns)
+    final = evaluate(problem, unknowns, free)
     limits = model.ROBUST * unknowns.noise[problem.pair]
-    weights = np.asarray(geman_mcclure_weight((evaluation.residuals / limits) ** 2))
-    covariance = np.zeros((GLOBAL, GLOBAL))
-    covariance[np.ix_(free, free)] = jackknife(
-        evaluation.score[:, free],
-        bent(weights) * evaluation.reduced[:, free][:, :, free],
-        stretches(problem.middles),
-        problem.prior[free],
-    )
-    if not converged:
-        covariance[np.ix_(free, free)] += _MOST_GAIN**2 * np.outer(at.newton, at.newton)
-    return Fit(
-        problem, unknowns, free, weights, covariance, evaluation.reduced.sum(axis=0), converged
-    )
+    weights = np.asarray(geman_mcclure_weight((final.residuals / limits) ** 2))
+    left = np.zeros_like(at.newton) if converged else at.newton
+    nothing = np.zeros((GLOBAL, GLOBAL))
+    return Fit(problem, unknowns, free, weights, nothing, final, converged, left)
+
+
+def _descended(problem: Problem, unknowns: Unknowns, free: Flags, rounds: int) -> _Iterate:
+    """State after some steps with the noise as it is."""
+    at = _begin(problem, unknowns, free)
+    for _ in range(rounds):
+        at = _step(problem, at, free)
+    return at
+
+
+def _settled(problem: Problem, unknowns: Unknowns) -> Unknowns:
+    """Unknowns after steps of the pairs' own unknowns."""
+    held = np.zeros(GLOBAL, dtype=bool)
+    return _descended(problem, unknowns, held, _SETTLING_STEPS).unknowns
+
+
+def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
+    """Noise (P,) of each pair by its residuals [px]."""
+    residuals = at.evaluation.residuals
+    of_pairs = [
+        robust_scale(residuals[begin:end], 0.0, _FITTED)
+        for begin, end in itertools.pairwise(problem.begin)
+    ]
+    middle = max(float(np.median(of_pairs)), _LEAST_NOISE)
+    noise = np.clip(of_pairs, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle)
+    return np.maximum(noise, at.unknowns.noise / _MOST_LESS)
+
+
+# -- Cost over the readout time -------------------------------------------------------------------
+
+# Readout times of the curve besides the best one, from an interval upwards to one downwards.
+# [chosen: enough to draw a parabola or two minima; each costs two steps]
+_CURVE_POINTS = 13
+# Steps of the fit at the best readout time, and at each of the others from its neighbour.
+# [chosen: the curve is drawn, not evaluated]
+_STEPS_AT_BEST = 5
+_STEPS_ALONG = 2
 
 
 def cost_curve(
@@ -365,279 +523,24 @@ def cost_curve(
     best = float(final.unknowns.parameters[READOUT])
     held = final.free.copy()
     held[READOUT] = False
-    values = np.unique(np.concatenate([np.linspace(-interval, interval, 13), [best]]))
-    costs = np.empty(len(values))
+    even = np.linspace(-interval, interval, _CURVE_POINTS)
+    values = np.unique(np.append(even, best))
+    costs = np.full(len(values), np.nan)
     order = np.argsort(np.abs(values - best))
-    begin = _refitted(problem, restarted(problem, final.unknowns), held, 5)
+    restart = restarted(problem, final.unknowns)
+    begin = _descended(problem, restart, held, _STEPS_AT_BEST).unknowns
     for side in (order[values[order] <= best], order[values[order] > best]):
         unknowns = begin
         for k in side:
             parameters = unknowns.parameters.copy()
             parameters[READOUT] = values[k]
-            unknowns = _refitted(problem, unknowns._replace(parameters=parameters), held, 2)
-            costs[k] = evaluate(problem, unknowns, derivatives=False).cost
+            moved = unknowns._replace(parameters=parameters)
+            at = _descended(problem, moved, held, _STEPS_ALONG)
+            unknowns, costs[k] = at.unknowns, at.evaluation.cost
             progress(float(np.isfinite(costs).mean()))
     # A match of a frame is in many pairs: scaled to the curvature 1 / sigma^2 at the minimum.
-    information = (
-        final.information * (problem.begin[-1] / final.problem.begin[-1]) + np.diag(problem.prior)
-    )[np.ix_(final.free, final.free)]
+    fewer = problem.begin[-1] / final.problem.begin[-1]
+    information = final.information * fewer + problem.prior[final.block]
     place = int(np.count_nonzero(final.free[:READOUT]))
     naive = float(np.linalg.inv(information)[place, place])
     return np.array([values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
-
-
-def _refitted(
-    problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], rounds: int
-) -> Unknowns:
-    """Unknowns after plain Gauss-Newton steps."""
-    for _ in range(rounds):
-        evaluation = evaluate(problem, unknowns)
-        H, gradient = _normal_equations(problem, evaluation, unknowns, free)
-        step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)), gradient)
-        unknowns = stepped(unknowns, step, evaluation.local_step(step))
-    return unknowns
-
-
-def _normal_equations(
-    problem: Problem, evaluation: Evaluation, unknowns: Unknowns, free: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Hessian and gradient of the cost with its prior by the free parameters."""
-    H = evaluation.reduced.sum(axis=0) + np.diag(problem.prior)
-    gradient = evaluation.score.sum(axis=0) + problem.prior * (
-        unknowns.parameters - problem.center
-    )
-    return H[np.ix_(free, free)], gradient[free]
-
-
-def _settled(problem: Problem, unknowns: Unknowns) -> Unknowns:
-    """Unknowns after two steps of the pairs' own unknowns."""
-    for _ in range(2):
-        still = np.zeros(GLOBAL)
-        moved = stepped(unknowns, still, evaluate(problem, unknowns).local_step(still))
-        unknowns = _chosen(problem, moved, unknowns)[0]
-    return unknowns
-
-
-def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns, float]:
-    """The calibration of `moved`, each pair with the better of its unknowns in both; the cost."""
-    stay = moved._replace(own=kept.own)
-    losses = evaluate(problem, moved, derivatives=False).losses
-    others = evaluate(problem, stay, derivatives=False).losses
-    better = losses <= others
-    unknowns = moved._replace(
-        own=np.where(better[:, None], moved.own, kept.own),
-        damping=np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING),
-    )
-    return unknowns, float(np.minimum(losses, others).sum())
-
-
-class _Iterate(NamedTuple):
-    """State of the fit."""
-
-    unknowns: Unknowns
-    evaluation: Evaluation
-    newton: Array  # Newton's step to here, of the free parameters
-    damping: float = 1e-3  # Levenberg-Marquardt's, of the calibration's parameters
-    length: float = math.inf  # of `newton` [sigma]
-    gain: float = 1.0  # step taken, over `newton`
-
-
-def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
-    """State after a step that lowers the cost; the same if none does."""
-
-    def prior_cost(unknowns: Unknowns) -> float:
-        return 0.5 * float(problem.prior @ (unknowns.parameters - problem.center) ** 2)
-
-    cost = at.evaluation.cost + prior_cost(at.unknowns)
-    H, gradient = _normal_equations(problem, at.evaluation, at.unknowns, free)
-    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient).astype(np.float64)
-    length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
-    # The weights of a robust loss make Gauss-Newton steps too short, by the share that the last
-    # step left of itself: J. Barzilai, J. M. Borwein, Two-point step size gradient methods, 1988.
-    left = float(newton @ H @ at.newton) / max(float(at.newton @ H @ at.newton), 1e-12)
-    gain = min(max(at.gain / max(1.0 - left, 1e-3), 1.0), _MOST_GAIN)
-    for _ in range(8):
-        step = np.zeros(GLOBAL)
-        step[free] = -gain * np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
-        tried = stepped(at.unknowns, step, at.evaluation.local_step(step))
-        result = evaluate(problem, tried)
-        if result.cost + prior_cost(tried) > cost:
-            tried, tried_cost = _chosen(problem, tried, at.unknowns)
-            if tried_cost + prior_cost(tried) > cost:
-                gain, damping = 1.0, max(10.0 * damping, 1e-3)
-                continue
-            result = evaluate(problem, tried)
-        return _Iterate(tried, result, newton, max(0.1 * damping, 1e-9), length, gain)
-    return at._replace(damping=damping, length=length)
-
-
-def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
-    """Noise (P,) of each pair by its residuals [px]; a third of the last at least."""
-    # Some three unknowns of each pair hide a part of it.
-    noise = np.array(
-        [
-            robust_scale(at.evaluation.residuals[begin:end], 0.0, 3.0)
-            for begin, end in itertools.pairwise(problem.begin)
-        ]
-    )
-    middle = max(float(np.median(noise)), _LEAST_NOISE)
-    return np.maximum(
-        np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle), at.unknowns.noise / 3.0
-    )
-
-
-def bent(weights: Array) -> float:
-    """Curvature of the loss, all (N,) matches, over the weight of Gauss-Newton."""
-    return float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
-
-
-# -- Errors beyond the noise of the matches ----------------------------------------------------
-
-# Regions of the image: columns and rows of equally many points.
-_COLUMNS, _ROWS = 4, 3
-# Squared difference, in sigmas, of the parameters of two halves by chance, at most: in the mean,
-# and of each.
-_CHANCE, _GROSS = 1.75, 9.0
-
-
-class ModelErrors(NamedTuple):
-    """Deviations of lens and gyro from their model, 1 sigma each."""
-
-    focal: float = 0.005  # focal length, relative
-    aspect: float = 0.002  # ratio of the two focal lengths
-    center: float = 0.005  # principal point, share of the image's width
-    radial: float = 0.02  # first coefficient of the distortion
-    second: float = 0.0  # second coefficient, r^4
-    gyro_scale: float = 0.005  # of each axis, relative
-    gyro_skew: float = 0.005  # between each two axes [rad]
-
-
-# Beyond an estimated lens: of the focal length, the first coefficient and the principal point.
-ESTIMATED_LENS = ModelErrors(focal=0.0, center=0.0, radial=0.0, second=0.02)
-
-
-def widened(final: Fit, errors: ModelErrors | None) -> Fit:
-    """The fit with a covariance of all errors, not only the noise of the matches."""
-    wider = np.sqrt(_between_regions(final) * _disagreement(final))
-    scatter = final.covariance * np.outer(wider, wider)
-    if errors is not None:
-        # One Newton step from the optimum with each error.
-        here = evaluate(final.problem, final.unknowns)
-        H, _ = _normal_equations(final.problem, here, final.unknowns, final.free)
-        gradients = [
-            (evaluate(*there).score - here.score).sum(axis=0)[final.free]
-            for there in _perturbed(final, errors)
-        ]
-        moves = np.linalg.solve(H, np.transpose(gradients))
-        scatter[np.ix_(final.free, final.free)] += moves @ moves.T
-    return replace(final, covariance=scatter)
-
-
-def _between_regions(final: Fit) -> Array:
-    """Factors (G,) of the variances by the scatter of regions of the image beyond that of cells.
-
-    Cells are regions times stretches of time: if the regions scatter no more than these, the
-    scatter of the stretches is complete.
-    """
-    problem, free, curve = final.problem, final.free, bent(final.weights)
-    index = np.ix_(free, free)
-    region, stretch = _regions(problem.points[0]), stretches(problem.middles)
-    sums = _sums(problem, final.unknowns, derivatives=True)
-    whole = _evaluation(problem, final.unknowns, sums)
-    prior = np.diag(problem.prior)
-    inverse = np.linalg.inv((curve * whole.reduced.sum(axis=0) + prior)[index])
-    moves, cells = [], np.zeros_like(inverse)
-    for name in np.unique(region):
-        of_region = _sums(problem.matches(region == name), final.unknowns, derivatives=True)
-        rest = _evaluation(
-            problem,
-            final.unknowns,
-            sums._replace(
-                gradient=sums.gradient - of_region.gradient,
-                hessian=sums.hessian - of_region.hessian,
-            ),
-        )
-        own = (whole.score - rest.score)[:, free]
-        rest_curvature = (curve * rest.reduced.sum(axis=0) + prior)[index]
-        moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
-        of_cells = np.stack([own[stretch == k].sum(axis=0) for k in np.unique(stretch)]) @ inverse
-        cells += of_cells.T @ of_cells
-    beyond = np.diag(jackknife_of(np.array(moves)) - cells)
-    factors = np.ones(GLOBAL)
-    factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
-    return factors
-
-
-def _regions(points: Array) -> NDArray[np.int64]:
-    """Region (N,) of the image of each point (N, 2): columns and rows of equally many points."""
-
-    def band(values: Array, count: int) -> NDArray[np.int64]:
-        borders = np.quantile(values, np.arange(1, count) / count)
-        return np.searchsorted(borders, values)
-
-    return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
-
-
-def _disagreement(final: Fit) -> Array:
-    """Factors (G,) of the variances by the difference of both halves; 1 if it is by chance."""
-    middles, free = final.problem.middles, final.free
-    first = middles < np.median(middles)
-    one, other = (
-        fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
-        for part in (first, ~first)
-    )
-    difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION] = log_so3(one.unknowns.R_imu_cam.T @ other.unknowns.R_imu_cam)
-    # The whole lets expect four times its own; less than half of that is chance, of few stretches.
-    variances = np.maximum(
-        np.diag(one.covariance + other.covariance), 2.0 * np.diag(final.covariance)
-    )
-    squares = difference[free] ** 2 / variances[free]
-    mean = float(np.minimum(squares, _GROSS).mean())
-    factors = np.ones(GLOBAL)
-    factors[free] = np.maximum(
-        mean if mean > _CHANCE else 1.0, np.where(squares > _GROSS, squares, 1.0)
-    )
-    return factors
-
-
-def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unknowns]]:
-    """Data and unknowns with one sigma of each error of the model."""
-    problem, unknowns = final.problem, final.unknowns
-    center = errors.center * float(
-        np.ptp(problem.points[0, :, 0]) / np.mean(problem.by_pixel[0, :, 0, 0])
-    )
-    for k, error in enumerate((errors.focal, errors.radial, center, center)):
-        if error:
-            parameters = unknowns.parameters.copy()
-            parameters[model.FOCAL + k] += error
-            yield problem, unknowns._replace(parameters=parameters)
-    squares = (problem.points**2).sum(axis=2, keepdims=True)
-    for points in (
-        problem.points / [1.0, 1.0 + errors.aspect],
-        problem.points * (1.0 - errors.second * squares**2),
-    ):
-        yield problem._replace(points=points), unknowns
-    for i in range(3):
-        for j in range(i + 1):
-            mixing = np.zeros((3, 3))
-            mixing[i, j] = mixing[j, i] = errors.gyro_scale if i == j else errors.gyro_skew
-            yield problem._replace(gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
-
-
-# Sigma of the direction of motion of a pair by the noise of its matches [rad], at the most.
-_KNOWN_DIRECTION = 0.1
-
-
-def move_of_poses(final: Fit, covariance: Array) -> float:
-    """Move of the direction of the median pair by the doubt of the parameters, over its sigma."""
-    problem, sums = final.problem, _sums(final.problem, final.unknowns, derivatives=True)
-    H = sums.hessian[:, GLOBAL:, GLOBAL:]
-    H = H + np.tril(H, -1).swapaxes(1, 2) + _local_priors(problem)[:, :, None] * np.eye(LOCAL)
-    back = _evaluation(problem, final.unknowns, sums).back[:, :2, :GLOBAL]
-    move, own = (
-        float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
-        for of_pairs in (back @ covariance @ back.swapaxes(1, 2), np.linalg.inv(H)[:, :2, :2])
-    )
-    return move / min(own, _KNOWN_DIRECTION)

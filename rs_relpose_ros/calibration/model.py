@@ -1,22 +1,20 @@
-"""Coplanarity of matches: residuals, their derivatives, and the direction of motion of a pair.
+"""Residuals of the matches of a recording, their derivatives, and the direction of a pair.
 
 Frame i exposes row v at ``t_i(v) = stamp_i + offset + slope k_i + s(v) readout`` with
-``s(v) = (v - middle row) / height``. With ``Q(t)`` the rotation by the gyro and ``n = (x, y, 1)``
-the undistorted point, ``m_i = M_i n_i`` with ``M_i = Q(t_i) R_imu_cam`` is the ray in a frame that
-does not rotate, and with the displacement b of the camera
+``s(v) = (v - middle row) / height``. With ``A(t)`` the rotation of the camera by the gyro and
+``n = (x, y, 1)`` the undistorted point, ``A(t_i) n_i`` is the ray in a frame that does not rotate.
+The residual of two rays and the displacement of the camera is that of `core.epipolar`; rotation
+and derivatives at a row are those of `core.rows`.
 
-    e = b . (m_1 x m_2) = 0,      r = e / s,  s = |de / d(pixels)|               [px]
-
-Each pair has unknowns of its own: the unit vector `direction`; `bend`, a change of velocity, which
-adds ``bend (s_1 + s_2)`` to b; and `turn`, the rotation that the noise of the gyro hides. The
-prior of `bend` is in units of |b|: a readout time that is too long gains no freedom by it. Points
-and their derivatives by the pixel are linear in the four parameters of the lens. All of it is in
-docs/calibration.md, "Method".
+Each pair has unknowns of its own: the unit vector `direction` of the displacement; `bend`, a
+change of velocity, which adds ``bend (s_1 + s_2)`` to it; and `turn`, the rotation that the noise
+of the gyro hides. The prior of `bend` is in units of the displacement: a readout time that is too
+long gains no freedom by it. Points and their derivatives by the pixel are linear in the parameters
+of the lens. All of it is in docs/calibration.md, "Method".
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,33 +22,54 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.core import deviations
 from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.core.epipolar import (
+    by_motion,
+    by_rays,
+    Residual,
+    residual,
+    square_at_baseline,
+    View,
+    write_constraint,
+)
 from rs_relpose_ros.core.least_squares import first_indices
+from rs_relpose_ros.core.losses import geman_mcclure_cost, geman_mcclure_weight, truncated_cost
+from rs_relpose_ros.core.rows import add_by_axes, add_by_gyro, add_by_time, TurnedPath
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.gyro import GyroPath, knot_before, write_state
-from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
+from rs_relpose_ros.geometry.lens import N_LENS
+from rs_relpose_ros.geometry.so3 import (
+    add,
+    cross,
+    dot,
+    multiply,
+    norm,
+    rotated,
+    rotated_back,
+    scale,
+    Vector,
+)
 from rs_relpose_ros.jit import inlined_kernel, kernel
 
 # -- Data and unknowns ----------------------------------------------------------------------------
 
-# Places of the parameters of the calibration, which are values of `OFFLINE` of `core.deviations`;
-# entries with more than one value have slices. The lens is beyond the assumed camera.
+# Places of the parameters of the calibration, which are the values of `OFFLINE`. Entries with more
+# than one value have slices. Those of the lens are beyond the assumed camera.
 READOUT = OFFLINE.index('readout_time')
 OFFSET = OFFLINE.index('time_offset')
 SLOPE = OFFLINE.index('offset_per_interval')
 ROTATION = OFFLINE.part('axes')
 BIAS = OFFLINE.part('gyro_bias')
+SCALE = OFFLINE.part('gyro_scale')
+SKEW = OFFLINE.part('gyro_skew')
 FOCAL = OFFLINE.index('focal_log')
-RADIAL = OFFLINE.index('distortion')
+ASPECT = OFFLINE.index('aspect')
+DISTORTION = OFFLINE.part('distortion')
 CENTER = OFFLINE.part('principal_point')
 EXPOSURE = OFFLINE.index('exposure_square')
+LENS = deviations.LENS
 GLOBAL = OFFLINE.size
-LENS = slice(FOCAL, EXPOSURE)
-# Deviations of the lens in the order of `geometry.lens` by the parameters `LENS`, (7, 4).
-LENS_BASIS = np.ascontiguousarray(OFFLINE.basis[deviations.LENS, LENS])
-# Kernels need numbers in place of slices.
-_FIRST_AXIS = ROTATION.start
-_FIRST_BIAS = BIAS.start
-_OF_LENS = EXPOSURE - FOCAL
+# First coefficient of the distortion.
+RADIAL = DISTORTION.start
 # Places of the unknowns of a pair, after the parameters: step of the direction in its tangent
 # plane (2), bend (3), turn (3) [rad].
 _UNKNOWNS = first_indices(parameters=GLOBAL, direction=2, bend=3, turn=3)
@@ -59,8 +78,13 @@ BEND = _UNKNOWNS['bend']
 TURN = _UNKNOWNS['turn']
 ALL = _UNKNOWNS['end']
 LOCAL = ALL - GLOBAL
-# Residual [sigma] beyond which the Geman-McClure loss is nearly constant.
+# Residual [sigma] beyond which the Geman-McClure loss is nearly constant. A smaller one takes good
+# matches for outliers, a larger one lets outliers move the optimum. [chosen: 3 sigmas, which one
+# match in 370 exceeds by chance]
 ROBUST = 3.0
+# Length below which the cross product of two constraints is no direction: the matches coincide.
+# [chosen: constraints of real matches are above 1e-6; any value in 1e-20..1e-10 would do]
+_LEAST_LENGTH = 1e-14
 
 
 class Problem(NamedTuple):
@@ -68,25 +92,23 @@ class Problem(NamedTuple):
 
     gyro_times: Array  # (K,) [s]
     gyro_rates: Array  # (K, 3) mean over the assumed exposure [rad/s]
-    # (K, 3) their derivative by the square of the exposure [rad/s^3], and its integral over time
-    # [rad/s^2].
-    blur_rates: Array
-    blur_turns: Array
+    blur_rates: Array  # (K, 3) their derivative by the square of the exposure [rad/s^3]
     times: Array  # (2, P) stamps of the frames of each pair [s]
     covariates: Array  # (2, P) covariates k_i of the offset; see `FrameTimes` [s]
     begin: NDArray[np.int64]  # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
     # (P,) knot of the gyro near the middle of the pair. `direction`, `bend` and `turn` are in the
-    # frame of that knot: in that of the start they would rotate with each step of the bias.
+    # axes of the camera at that knot: in those of the start they would rotate with each step of
+    # the bias.
     middle: NDArray[np.int64]
     # Of both frames of each match:
     rows: Array  # (2, N) s(v) of the raw rows
     points: Array  # (2, N, 2) undistorted and normalised with the assumed camera
     by_pixel: Array  # (2, N, 2, 2) derivative of the normalised point by the pixel
-    by_lens: Array  # (2, N, 2, 4) derivative of the normalised point by the lens
-    by_pixel_by_lens: Array  # (2, N, 2, 2, 4) derivative of `by_pixel` by the lens
+    by_lens: Array  # (2, N, 2, 7) derivative of the normalised point by the lens
+    by_pixel_by_lens: Array  # (2, N, 2, 2, 7) derivative of `by_pixel` by the lens
     bend_sigma: Array  # (P,) 1 sigma of each component of `bend`
     turn_sigma: Array  # (P,) 1 sigma of each component of `turn` [rad]
-    prior: Array  # (GLOBAL,) inverse variances of the parameters
+    prior: Array  # (GLOBAL, GLOBAL) information of the parameters before the fit
     center: Array  # (GLOBAL,) their means by the prior
 
     @property
@@ -128,9 +150,9 @@ class Problem(NamedTuple):
 class Unknowns(NamedTuple):
     """The calibration and the unknowns of the pairs."""
 
-    # (GLOBAL,) with zeros in place of the rotation, which is `R_imu_cam`.
+    # (GLOBAL,) with zeros in place of the axes, which are `R_cam_imu`.
     parameters: Array
-    R_imu_cam: Array  # (3, 3)
+    R_cam_imu: Array  # (3, 3)
     own: Array  # (P, 9) of each pair: unit vector `direction`, `bend`, and `turn` [rad]
     noise: Array  # (P,) 1 sigma of the residuals [px]
     damping: Array  # (P,) Levenberg-Marquardt damping of the pair's own unknowns
@@ -143,45 +165,50 @@ class Unknowns(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Results of a pass over all matches; the last two are empty unless requested."""
+    """Results of a pass over all matches; the last two are empty unless requested.
+
+    Their k parameters are those of `accumulate`.
+    """
 
     losses: Array  # (P,) robust loss
     residuals: Array  # (N,) [px]
-    gradient: Array  # (P, ALL) of the losses
-    hessian: Array  # (P, ALL, ALL) Gauss-Newton approximation, lower triangles
+    gradient: Array  # (P, k + LOCAL) of the losses
+    hessian: Array  # (P, k + LOCAL, k + LOCAL) Gauss-Newton approximation, lower triangles
+
+
+# -- One match ------------------------------------------------------------------------------------
 
 
 class _Sight(NamedTuple):
     """Memory for the camera at the time of a row; overwritten for each match."""
 
-    Q: Array  # (3, 3) rotation of the IMU
-    M: Array  # (3, 3) rotation of the camera
-    rate: Array  # (3,) of the IMU [rad/s]
-    blur: Array  # (3,) turn of the IMU by the square of the exposure [rad/s^2]
-    by_bias: Array  # (3, 3) integral of the rotations since the middle of the pair [s]
-
-
-@kernel
-def _new_sight() -> _Sight:
-    return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)))
+    by_gyro: Array  # (3, 3) rotation by the gyro alone, to the axes of the start
+    rate: Array  # (3,) of the camera [rad/s]
+    rotation: Array  # (3, 3) the same rotation with the `turn` of the pair
 
 
 @inlined_kernel
-def _look(
-    path: GyroPath,
-    R_imu_cam: Array,
-    correction: Array,
-    point: Array,
-    time: float,
-    near: int,
-    sight: _Sight,
-) -> tuple[int, Vector]:
-    """Fill Q, M and rate of `sight` at a time; the knot before it, and the ray of a point."""
+def _new_sight() -> _Sight:
+    return _Sight(np.empty((3, 3)), np.empty(3), np.empty((3, 3)))
+
+
+@inlined_kernel
+def _look(path: GyroPath, correction: Array, time: float, near: int, sight: _Sight) -> int:
+    """Fill `sight` at a time; return the knot before it."""
     k = knot_before(path.times, time, near)
-    write_state(path, time, k, sight.M, sight.rate)
-    multiply(correction, sight.M, sight.Q)
-    multiply(sight.Q, R_imu_cam, sight.M)
-    return k, rotated(sight.M, (point[0], point[1], 1.0))
+    write_state(path, time, k, sight.by_gyro, sight.rate)
+    multiply(correction, sight.by_gyro, sight.rotation)
+    return k
+
+
+@inlined_kernel
+def _view(rotation: Array, point: Array, by_pixel: Array) -> View:
+    """Ray of a match, and its derivatives by the pixel, in the axes of the start."""
+    return View(
+        rotated(rotation, (point[0], point[1], 1.0)),
+        rotated(rotation, (by_pixel[0, 0], by_pixel[1, 0], 0.0)),
+        rotated(rotation, (by_pixel[0, 1], by_pixel[1, 1], 0.0)),
+    )
 
 
 @inlined_kernel
@@ -194,251 +221,188 @@ def _starts(problem: Problem, p: int, parameters: Array) -> tuple[float, float]:
 
 
 @inlined_kernel
-def _by_pixels(M: Array, P: Array, c: Vector) -> tuple[float, Vector]:
-    """``|P^T M^T c|^2`` and ``k = M P P^T M^T c`` with P the derivative by the pixel."""
-    h = rotated_back(M, c)
-    q0 = P[0, 0] * h[0] + P[1, 0] * h[1]
-    q1 = P[0, 1] * h[0] + P[1, 1] * h[1]
-    k = rotated(M, (P[0, 0] * q0 + P[0, 1] * q1, P[1, 0] * q0 + P[1, 1] * q1, 0.0))
-    return q0 * q0 + q1 * q1, k
+def _add_lens(J: Array, rotation: Array, by: View, problem: Problem, side: int, n: int) -> None:
+    """Add the derivatives by the lens through the ray of one frame and its derivatives."""
+    ray = rotated_back(rotation, by.ray)
+    by_u, by_v = rotated_back(rotation, by.by_u), rotated_back(rotation, by.by_v)
+    by_lens, by_pixel = problem.by_lens[side, n], problem.by_pixel_by_lens[side, n]
+    for k in range(N_LENS):
+        for i in range(2):
+            J[FOCAL + k] += ray[i] * by_lens[i, k]
+            J[FOCAL + k] += by_u[i] * by_pixel[i, 0, k] + by_v[i] * by_pixel[i, 1, k]
 
 
 @inlined_kernel
-def _less(a: Vector, factor: float, b: Vector, divisor: float) -> Vector:
-    """``(a - factor b) / divisor``."""
-    return (
-        (a[0] - factor * b[0]) / divisor,
-        (a[1] - factor * b[1]) / divisor,
-        (a[2] - factor * b[2]) / divisor,
+def _add_match(
+    J: Array,
+    columns: NDArray[np.int64],
+    chosen: Array,
+    r: float,
+    weight: float,
+    gradient: Array,
+    hessian: Array,
+) -> None:
+    """Add the residual of a match to the gradient and the lower triangle of the Hessian."""
+    for i in range(len(columns)):
+        chosen[i] = J[columns[i]]
+        weighted = weight * chosen[i]
+        gradient[i] += r * weighted
+        for j in range(i + 1):
+            hessian[i, j] += weighted * chosen[j]
+
+
+# -- All matches ----------------------------------------------------------------------------------
+
+
+class _Pair(NamedTuple):
+    """A pair at the current unknowns, in the axes of the start."""
+
+    number: int
+    Q_middle: Array  # (3, 3) rotation of the camera at the middle knot
+    straight: Vector
+    bend: Vector
+    # (3, 3) rotations by half of the turn, back for frame 1 and forwards for frame 2.
+    turn1: Array
+    turn2: Array
+    starts: tuple[float, float]  # times of the middle rows [s]
+
+
+class _Match(NamedTuple):
+    """A match at the current unknowns."""
+
+    number: int
+    first: View
+    second: View
+    baseline: Vector
+    residual: Residual
+    # Times of the rows, and the knots before them.
+    time1: float
+    time2: float
+    knot1: int
+    knot2: int
+
+
+@inlined_kernel
+def _pair(problem: Problem, path: GyroPath, unknowns: Unknowns, p: int) -> _Pair:
+    """Read pair p."""
+    Q_middle, own = path.rotations[problem.middle[p]], unknowns.own[p]
+    half = so3.exp_so3(0.5 * (Q_middle @ own[6:]))
+    return _Pair(
+        p,
+        Q_middle,
+        rotated(Q_middle, own[:3]),
+        rotated(Q_middle, own[3:6]),
+        np.ascontiguousarray(half.T),
+        half,
+        _starts(problem, p, unknowns.parameters),
     )
 
 
 @inlined_kernel
-def _derivatives(
-    r: float,
-    s: float,
-    m1: Vector,
-    m2: Vector,
-    b: Vector,
-    c1: Vector,
-    c2: Vector,
-    k1: Vector,
-    k2: Vector,
-) -> tuple[Vector, Vector, Vector, Vector, Vector]:
-    """Of r by m_1 and m_2, by a small rotation of all of frame 1 and of frame 2, and by b.
-
-    ``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``.
-    """
-    ratio = r / s
-    by_m1 = _less(c1, ratio, cross(k2, b), s)
-    by_m2 = _less(c2, ratio, cross(b, k1), s)
-    # A rotation of a frame rotates its M together with its ray.
-    by_1 = _less(cross(m1, by_m1), -ratio / s, cross(c1, k1), 1.0)
-    by_2 = _less(cross(m2, by_m2), -ratio / s, cross(c2, k2), 1.0)
-    by_b = _less(_less(cross(m1, m2), ratio, cross(k1, m2), 1.0), ratio, cross(m1, k2), s)
-    return by_m1, by_m2, by_1, by_2, by_b
-
-
-@inlined_kernel
-def _add_view(
-    J: Array,
-    by_turn: Vector,
-    sight: _Sight,
-    row: float,
-    covariate: float,
-    share: float,
-    Q_middle: Array,
-) -> None:
-    """Add the derivatives through the orientation of one frame.
-
-    `by_turn` is the derivative by a small rotation of the frame, of which `share` follows `turn`.
-    """
-    by_time = dot(by_turn, rotated(sight.Q, sight.rate))
-    J[READOUT] += row * by_time
-    J[OFFSET] += by_time
-    J[SLOPE] += covariate * by_time
-    J[EXPOSURE] += dot(by_turn, rotated(sight.Q, sight.blur))
-    by_axes = rotated_back(sight.M, by_turn)  # R_imu_cam Exp(-c)
-    by_bias = rotated_back(sight.by_bias, by_turn)
-    by_own_turn = rotated_back(Q_middle, by_turn)
-    for i in range(3):
-        J[_FIRST_AXIS + i] -= by_axes[i]
-        J[_FIRST_BIAS + i] -= by_bias[i]
-        J[TURN + i] += share * by_own_turn[i]
-
-
-@inlined_kernel
-def _add_lens(
-    J: Array, problem: Problem, side: int, n: int, by_m: Vector, c: Vector, M: Array, ratio: float
-) -> None:
-    """Add the derivatives by the lens through one frame: by its ray, and by s through P.
-
-    ``s ds = (P^T h) . (dP^T h)`` with ``h = M^T c``; `ratio` is r / s^2.
-    """
-    by_point, h, P = rotated_back(M, by_m), rotated_back(M, c), problem.by_pixel[side, n]
-    q0 = ratio * (P[0, 0] * h[0] + P[1, 0] * h[1])
-    q1 = ratio * (P[0, 1] * h[0] + P[1, 1] * h[1])
-    by_lens, dP = problem.by_lens[side, n], problem.by_pixel_by_lens[side, n]
-    for k in range(_OF_LENS):
-        J[FOCAL + k] += (
-            by_point[0] * by_lens[0, k]
-            + by_point[1] * by_lens[1, k]
-            - q0 * (dP[0, 0, k] * h[0] + dP[1, 0, k] * h[1])
-            - q1 * (dP[0, 1, k] * h[0] + dP[1, 1, k] * h[1])
-        )
-
-
-@inlined_kernel
-def _integrate(
+def _match(
     problem: Problem,
     path: GyroPath,
-    turned: Array,
-    middle: int,
-    k: int,
-    time: float,
-    sight: _Sight,
+    pair: _Pair,
+    readout: float,
+    n: int,
+    near: tuple[int, int],
+    sight1: _Sight,
+    sight2: _Sight,
+) -> _Match:
+    """Evaluate match n, and fill the sights of its two rows; `near` are knots to search from."""
+    row1, row2 = problem.rows[0, n], problem.rows[1, n]
+    time1, time2 = pair.starts[0] + row1 * readout, pair.starts[1] + row2 * readout
+    knot1 = _look(path, pair.turn1, time1, near[0], sight1)
+    knot2 = _look(path, pair.turn2, time2, near[1], sight2)
+    first = _view(sight1.rotation, problem.points[0, n], problem.by_pixel[0, n])
+    second = _view(sight2.rotation, problem.points[1, n], problem.by_pixel[1, n])
+    baseline = add(pair.straight, scale(row1 + row2, pair.bend))
+    at = residual(first, second, baseline)
+    return _Match(n, first, second, baseline, at, time1, time2, knot1, knot2)
+
+
+@inlined_kernel
+def _write_derivatives(
+    J: Array,
+    problem: Problem,
+    turned: TurnedPath,
+    tangent: Array,
+    pair: _Pair,
+    match: _Match,
+    sight1: _Sight,
+    sight2: _Sight,
 ) -> None:
-    """Fill blur and by_bias of `sight` at a time after knot `k`."""
-    dt = time - path.times[k]
-    half_share = 0.5 * dt / (path.times[k + 1] - path.times[k])
-    for i in range(3):
-        change = problem.blur_rates[k + 1, i] - problem.blur_rates[k, i]
-        sight.blur[i] = problem.blur_turns[k, i] + dt * (
-            problem.blur_rates[k, i] + half_share * change
-        )
-        for j in range(3):
-            sight.by_bias[i, j] = (
-                turned[k, i, j] - turned[middle, i, j] + dt * path.rotations[k, i, j]
-            )
-
-
-@inlined_kernel
-def _add_match(J: Array, r: float, weight: float, gradient: Array, hessian: Array) -> None:
-    """Add the residual of a match to the gradient and the lower triangle of the Hessian."""
+    """Write the derivatives of a match by all parameters but the lens, and by the pair's own."""
+    n, p = match.number, pair.number
+    row1, row2 = problem.rows[0, n], problem.rows[1, n]
     for i in range(ALL):
-        gradient[i] += weight * r * J[i]
-        for j in range(i + 1):
-            hessian[i, j] += weight * J[i] * J[j]
-
-
-@inlined_kernel
-def _own_motion(Q_middle: Array, own: Array) -> tuple[Vector, Vector, Array, Array]:
-    """Direction and bend of a pair, and half of its turn forwards (frame 2) and back (frame 1)."""
-    half = so3.exp_so3(0.5 * (Q_middle @ own[6:]))
-    straight, bend = rotated(Q_middle, own[:3]), rotated(Q_middle, own[3:6])
-    return straight, bend, half, np.ascontiguousarray(half.T)
-
-
-@inlined_kernel
-def _add_own(J: Array, by_b: Vector, tangent: Array, rows: float) -> None:
-    """Write the derivatives by direction and bend of the pair."""
-    J[DIRECTION], J[DIRECTION + 1] = dot(tangent[0], by_b), dot(tangent[1], by_b)
+        J[i] = 0.0
+    by_b, by_1, by_2 = by_motion(match.first, match.second, match.baseline, match.residual)
+    by_path1, by_path2 = rotated_back(pair.turn1, by_1), rotated_back(pair.turn2, by_2)
+    add_by_axes(J, by_path1, sight1.by_gyro)
+    add_by_axes(J, by_path2, sight2.by_gyro)
+    covariate1, covariate2 = problem.covariates[0, p], problem.covariates[1, p]
+    add_by_time(J, by_path1, sight1.by_gyro, sight1.rate, row1, covariate1)
+    add_by_time(J, by_path2, sight2.by_gyro, sight2.rate, row2, covariate2)
+    add_by_gyro(J, by_path1, turned, match.time1, match.knot1)
+    add_by_gyro(J, by_path2, turned, match.time2, match.knot2)
+    # The displacement rotates with the camera at the middle of the pair.
+    by_middle = cross(match.baseline, by_b)
+    middle = problem.middle[p]
+    add_by_axes(J, by_middle, pair.Q_middle)
+    times = turned.path.times
+    add_by_gyro(J, by_middle, turned, times[middle], min(middle, len(times) - 2))
+    by_direction = rotated_back(pair.Q_middle, by_b)
+    J[DIRECTION] = dot(tangent[0], by_direction)
+    J[DIRECTION + 1] = dot(tangent[1], by_direction)
+    by_turn = rotated_back(pair.Q_middle, add(by_2, scale(-1.0, by_1)))
     for i in range(3):
-        J[BEND + i] = rows * by_b[i]
+        J[BEND + i] = (row1 + row2) * by_direction[i]
+        J[TURN + i] = 0.5 * by_turn[i]
 
 
 @kernel
 def accumulate(
     problem: Problem,
-    path: GyroPath,
-    turned: Array,
+    turned: TurnedPath,
     unknowns: Unknowns,
     tangent: Array,
-    derivatives: bool,
+    columns: NDArray[np.int64],
     sums: Sums,
 ) -> None:
     """Sum robust losses, gradients and Hessians over the matches of each pair, without priors.
 
-    `turned` (K, 3, 3) is the integral of the rotations over time at the knots [s]: a rate error db
-    turns the rotation at knot k by ``turned_k db``, in the frame of the start. `tangent` (P, 2, 3)
-    spans the steps of each direction. With ``d = r / noise`` and
-    ``l = 1 / (1 + d^2 / ROBUST^2)`` the loss of a match is ``d^2 l / 2`` (Geman-McClure).
+    `tangent` (P, 2, 3) spans the steps of each direction. `columns` are the places of the k
+    parameters of `sums` and of the unknowns of a pair; without any, the losses alone are summed.
+    With ``q = (r / noise / ROBUST)^2`` the loss of a match is ``ROBUST^2 q / (1 + q) / 2``
+    (Geman-McClure).
     """
-    parameters = unknowns.parameters
-    readout = parameters[READOUT]
-    sight1, sight2, J = _new_sight(), _new_sight(), np.empty(ALL)
+    readout = unknowns.parameters[READOUT]
+    sight1, sight2 = _new_sight(), _new_sight()
+    J, chosen = np.empty(ALL), np.empty(len(columns))
+    has_lens = False
+    for column in columns:
+        has_lens = has_lens or FOCAL <= column < GLOBAL
     for p in range(len(problem.middle)):
-        middle, covariates = problem.middle[p], problem.covariates[:, p]
-        Q_middle = path.rotations[middle]
-        straight, bend, half, half_back = _own_motion(Q_middle, unknowns.own[p])
-        starts = _starts(problem, p, parameters)
-        k1 = k2 = middle
-        per_noise2 = 1.0 / unknowns.noise[p] ** 2
+        pair = _pair(problem, turned.path, unknowns, p)
+        near = (problem.middle[p], problem.middle[p])
+        variance = unknowns.noise[p] ** 2
+        limit = ROBUST**2 * variance
         sums.losses[p] = 0.0
         for n in range(problem.begin[p], problem.begin[p + 1]):
-            row1, row2 = problem.rows[0, n], problem.rows[1, n]
-            t1, t2 = starts[0] + row1 * readout, starts[1] + row2 * readout
-            k1, m1 = _look(
-                path, unknowns.R_imu_cam, half_back, problem.points[0, n], t1, k1, sight1
-            )
-            k2, m2 = _look(path, unknowns.R_imu_cam, half, problem.points[1, n], t2, k2, sight2)
-            rows = row1 + row2
-            b = _less(straight, -rows, bend, 1.0)  # straight + rows bend
-            c1, c2 = cross(m2, b), cross(b, m1)  # e = m_1 . c_1 = m_2 . c_2
-            square1, by_pixels1 = _by_pixels(sight1.M, problem.by_pixel[0, n], c1)
-            square2, by_pixels2 = _by_pixels(sight2.M, problem.by_pixel[1, n], c2)
-            s = math.sqrt(max(square1 + square2, 1e-16))
-            r = sums.residuals[n] = dot(m1, c1) / s
-            distance2 = r**2 * per_noise2
-            level = 1.0 / (1.0 + distance2 / ROBUST**2)
-            sums.losses[p] += 0.5 * distance2 * level
-            if not derivatives:
+            match = _match(problem, turned.path, pair, readout, n, near, sight1, sight2)
+            near = (match.knot1, match.knot2)
+            r = sums.residuals[n] = match.residual.value
+            sums.losses[p] += 0.5 * ROBUST**2 * geman_mcclure_cost(r * r / limit)
+            if len(columns) == 0:
                 continue
-            by_m1, by_m2, by_1, by_2, by_b = _derivatives(
-                r, s, m1, m2, b, c1, c2, by_pixels1, by_pixels2
-            )
-            J[:] = 0.0
-            _integrate(problem, path, turned, middle, k1, t1, sight1)
-            _integrate(problem, path, turned, middle, k2, t2, sight2)
-            _add_view(J, by_1, sight1, row1, covariates[0], -0.5, Q_middle)
-            _add_view(J, by_2, sight2, row2, covariates[1], 0.5, Q_middle)
-            _add_lens(J, problem, 0, n, by_m1, c1, sight1.M, r / s**2)
-            _add_lens(J, problem, 1, n, by_m2, c2, sight2.M, r / s**2)
-            _add_own(J, rotated_back(Q_middle, by_b), tangent[p], rows)
-            _add_match(J, r, level * level * per_noise2, sums.gradient[p], sums.hessian[p])
-
-
-@kernel
-def eliminate(
-    sums: Sums, prior: Array, damping: Array, score: Array, reduced: Array, back: Array
-) -> None:
-    """Fill the normal equations of the parameters, and how the pairs' own unknowns follow them.
-
-    With ``H_ll + prior = L L^T`` (diagonal times ``1 + damping``) and ``Y = L^-1 [H_lg, g_l]``:
-    ``score = g_g - Y_g^T y_l``, ``reduced = H_gg - Y_g^T Y_g``, ``back = L^-T Y``.
-    """
-    L = np.empty((LOCAL, LOCAL))
-    for p in range(len(prior)):
-        gradient, H, Y = sums.gradient[p], sums.hessian[p], back[p]
-        for i in range(LOCAL):
-            for j in range(i):
-                value = H[GLOBAL + i, GLOBAL + j]
-                for k in range(j):
-                    value -= L[i, k] * L[j, k]
-                L[i, j] = value / L[j, j]
-            value = (H[GLOBAL + i, GLOBAL + i] + prior[p, i]) * (1.0 + damping[p])
-            for k in range(i):
-                value -= L[i, k] ** 2
-            L[i, i] = math.sqrt(value)
-            for c in range(GLOBAL + 1):
-                value = H[GLOBAL + i, c] if c < GLOBAL else gradient[GLOBAL + i]
-                for k in range(i):
-                    value -= L[i, k] * Y[k, c]
-                Y[i, c] = value / L[i, i]
-        for i in range(GLOBAL):
-            score[p, i] = gradient[i]
-            for k in range(LOCAL):
-                score[p, i] -= Y[k, i] * Y[k, GLOBAL]
-            for j in range(i + 1):
-                value = H[i, j]
-                for k in range(LOCAL):
-                    value -= Y[k, i] * Y[k, j]
-                reduced[p, i, j] = reduced[p, j, i] = value
-        for i in range(LOCAL - 1, -1, -1):
-            for c in range(GLOBAL + 1):
-                for k in range(i + 1, LOCAL):
-                    Y[i, c] -= L[k, i] * Y[k, c]
-                Y[i, c] /= L[i, i]
+            _write_derivatives(J, problem, turned, tangent[p], pair, match, sight1, sight2)
+            if has_lens:
+                by1, by2 = by_rays(match.first, match.second, match.baseline, match.residual)
+                _add_lens(J, sight1.rotation, by1, problem, 0, n)
+                _add_lens(J, sight2.rotation, by2, problem, 1, n)
+            weight = geman_mcclure_weight(r * r / limit) / variance
+            _add_match(J, columns, chosen, r, weight, sums.gradient[p], sums.hessian[p])
 
 
 @kernel
@@ -448,78 +412,53 @@ def find_directions(
     """Replace each direction by the best of itself and of those that two matches each fix.
 
     `chosen` (K, 2) are large random numbers that pick the matches. The best has the least sum of
-    ``min((e / s)^2, limit)``; of each match ``e = normal . b`` and ``s^2 = b^T square b``.
+    the squared residuals, each limited to that of an outlier.
     """
     most = np.diff(problem.begin).max()
-    normals, squares = np.empty((most, 3)), np.empty((most, 3, 3))
+    constraints = np.empty((most, 5, 3))
     for p in range(len(problem.middle)):
         count = problem.begin[p + 1] - problem.begin[p]
         Q_middle = path.rotations[problem.middle[p]]
-        _constraints(problem, path, unknowns, p, normals, squares)
+        _write_constraints(problem, path, unknowns, p, constraints)
         limit = (ROBUST * unknowns.noise[p]) ** 2
+        own = unknowns.own[p]
         least, best = np.inf, (0.0, 0.0, 0.0)
         for h in range(-1, len(chosen)):
             if h < 0:
-                b = rotated(Q_middle, unknowns.own[p, :3])
+                b = rotated(Q_middle, own[:3])
             else:
-                b = cross(normals[chosen[h, 0] % count], normals[chosen[h, 1] % count])
+                one, other = chosen[h, 0] % count, chosen[h, 1] % count
+                b = cross(constraints[one, 0], constraints[other, 0])
             length = norm(b)
-            if length < 1e-14:
+            if length < _LEAST_LENGTH:
                 continue
-            b = (b[0] / length, b[1] / length, b[2] / length)
+            b = scale(1.0 / length, b)
             cost = 0.0
             for i in range(count):
-                s2 = max(dot(b, rotated(squares[i], b)), 1e-16)
-                cost += min(dot(normals[i], b) ** 2 / s2, limit)
+                cost += truncated_cost(square_at_baseline(constraints[i], b), limit)
                 if cost >= least:
                     break
             if cost < least:
                 least, best = cost, b
         if least < np.inf:
-            own = unknowns.own[p]
             own[0], own[1], own[2] = rotated_back(Q_middle, best)
 
 
 @kernel
-def _constraints(
-    problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, normals: Array, squares: Array
+def _write_constraints(
+    problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, constraints: Array
 ) -> None:
-    """Fill `normals` and `squares` of the matches of a pair."""
-    parameters = unknowns.parameters
-    uncorrected, sight1, sight2 = np.eye(3), _new_sight(), _new_sight()
+    """Write the constraints of the matches of a pair on its direction."""
+    parameters, uncorrected = unknowns.parameters, np.eye(3)
+    sight1, sight2 = _new_sight(), _new_sight()
     starts = _starts(problem, p, parameters)
     k1 = k2 = problem.middle[p]
     for i in range(problem.begin[p + 1] - problem.begin[p]):
         n = problem.begin[p] + i
-        k1, m1 = _look(
-            path,
-            unknowns.R_imu_cam,
-            uncorrected,
-            problem.points[0, n],
-            starts[0] + problem.rows[0, n] * parameters[READOUT],
-            k1,
-            sight1,
-        )
-        k2, m2 = _look(
-            path,
-            unknowns.R_imu_cam,
-            uncorrected,
-            problem.points[1, n],
-            starts[1] + problem.rows[1, n] * parameters[READOUT],
-            k2,
-            sight2,
-        )
-        normals[i, 0], normals[i, 1], normals[i, 2] = cross(m1, m2)
-        squares[i] = 0.0
-        _add_squares(problem.by_pixel[0, n], sight1.M, m2, squares[i])
-        _add_squares(problem.by_pixel[1, n], sight2.M, m1, squares[i])
-
-
-@inlined_kernel
-def _add_squares(P: Array, M: Array, other: Vector, square: Array) -> None:
-    """Add ``g g^T`` of both pixel coordinates of one frame, with ``de/dpixel = g . b``."""
-    for r in range(2):
-        g = cross(rotated(M, (P[0, r], P[1, r], 0.0)), other)
-        for c in range(3):
-            for d in range(3):
-                square[c, d] += g[c] * g[d]
+        t1 = starts[0] + problem.rows[0, n] * parameters[READOUT]
+        t2 = starts[1] + problem.rows[1, n] * parameters[READOUT]
+        k1 = _look(path, uncorrected, t1, k1, sight1)
+        k2 = _look(path, uncorrected, t2, k2, sight2)
+        first = _view(sight1.rotation, problem.points[0, n], problem.by_pixel[0, n])
+        second = _view(sight2.rotation, problem.points[1, n], problem.by_pixel[1, n])
+        write_constraint(first, second, constraints[i])

@@ -22,6 +22,7 @@ from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 
@@ -29,7 +30,7 @@ AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracks:
+class TrackedPoints:
     """Observations of points over frames."""
 
     stamps_ns: NDArray[np.int64]  # (F,) of the frames, camera clock, strictly increasing
@@ -75,7 +76,7 @@ class PairSelection(NamedTuple):
 
 
 def make_pairs(
-    tracks: Tracks,
+    tracks: TrackedPoints,
     gaps: Sequence[int],
     selection: PairSelection,
     max_interval: float,
@@ -248,9 +249,9 @@ _LEAST_COSINE = 0.05
 class Observations:
     """A recording, in seconds since the first frame."""
 
-    tracks: Tracks  # of points that the camera model can map to rays
+    tracks: TrackedPoints  # of points that the camera model can map to rays
     camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
-    lens: Array  # (4,) parameters `model.LENS`
+    lens: Array  # (7,) parameters `model.LENS`
     times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes
     exposure: Exposure  # before the fit
@@ -262,15 +263,15 @@ class Observations:
     @classmethod
     def of(
         cls,
-        tracks: Tracks,
+        tracks: TrackedPoints,
         gyro: GyroSeries,
         camera: RollingShutterCamera,
         config: CalibrationConfig | None = None,
-        lens: ArrayLike = (0.0, 0.0, 0.0, 0.0),
+        lens: ArrayLike = (0.0,) * N_LENS,
     ) -> Observations:
         """Observations of at least two frames and two samples."""
         lens = np.array(lens)
-        camera = camera.moved_lens(model.LENS_BASIS @ lens)
+        camera = camera.moved_lens(lens)
         rays = camera.unproject(tracks.points)
         ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > _LEAST_COSINE)
         tracks = replace(
@@ -356,15 +357,8 @@ class Observations:
         times1, times2 = self.times[frames]
         middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_ROTATION**2)
-        prior, center = np.zeros(model.GLOBAL), np.zeros(model.GLOBAL)
+        center = np.zeros(model.GLOBAL)
         center[model.LENS] = -self.lens
-        prior[model.BIAS] = _BIAS_SIGMA**-2
-        prior[model.SLOPE] = _SLOPE_SIGMA**-2
-        prior[model.RADIAL] = _RADIAL_SIGMA**-2
-        prior[model.CENTER] = (_CENTER_SIGMA * self.camera.width) ** -2
-        if self.exposure.square_sigma:
-            prior[model.EXPOSURE] = self.exposure.square_sigma**-2
-        blur_turns = cumulative_trapezoid(self.blur_rates, self.gyro_times, axis=0, initial=0.0)
         pixels = self.tracks.points[np.hstack([pair.rows for pair in pairs])]
         height = self.camera.height
         of_pixels = self.camera.points_by_lens(pixels.reshape(-1, 2))
@@ -372,7 +366,6 @@ class Observations:
             self.gyro_times,
             self.gyro_rates,
             self.blur_rates,
-            blur_turns,
             self.times[frames],
             self.stamps.covariates[frames],
             np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]),
@@ -380,13 +373,24 @@ class Observations:
             (pixels[:, :, 1] - 0.5 * (height - 1)) / height,
             of_pixels.values.reshape(pixels.shape),
             of_pixels.by_pixel.reshape(*pixels.shape, 2),
-            (of_pixels.by_lens @ model.LENS_BASIS).reshape(*pixels.shape, 4),
-            (of_pixels.by_pixel_by_lens @ model.LENS_BASIS).reshape(*pixels.shape, 2, 4),
+            of_pixels.by_lens.reshape(*pixels.shape, N_LENS),
+            of_pixels.by_pixel_by_lens.reshape(*pixels.shape, 2, N_LENS),
             np.full(len(pairs), _BEND_AT_START),
             turn_sigma,
-            prior,
+            self._prior(),
             center,
         )
+
+    def _prior(self) -> Array:
+        """Information (GLOBAL, GLOBAL) of the parameters before the fit."""
+        information = np.zeros(model.GLOBAL)
+        information[model.BIAS] = _BIAS_SIGMA**-2
+        information[model.SLOPE] = _SLOPE_SIGMA**-2
+        information[model.RADIAL] = _RADIAL_SIGMA**-2
+        information[model.CENTER] = (_CENTER_SIGMA * self.camera.width) ** -2
+        if self.exposure.square_sigma:
+            information[model.EXPOSURE] = self.exposure.square_sigma**-2
+        return np.diag(information)
 
 
 # -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------

@@ -48,6 +48,8 @@ ENTRIES = (
     Entry('gyro_scale', 3, '', 0.2, 0.3),
     # w_true = (I + M) w with M symmetric, zero on its diagonal: yz, xz, xy.
     Entry('gyro_skew', 3, 'rad', 0.005, 0.02),
+    # Square of the exposure time, over which the rates of the gyro are averaged.
+    Entry('exposure_square', 1, 's^2', 1e-4, 1e-3),
     # The next four are those of `geometry.lens`, in its order. f_true = f exp(c), both.
     Entry('focal_log', 1, '', 0.3, 0.45),
     # fy / fx.
@@ -55,8 +57,6 @@ ENTRIES = (
     # Coefficients k1, k2, k3.
     Entry('distortion', 3, '', 0.5, 0.6),
     Entry('principal_point', 2, 'px', 10.0, 50.0),
-    # Square of the exposure time.
-    Entry('exposure_square', 1, 's^2', 1e-4, 1e-3),
 )
 
 
@@ -146,18 +146,8 @@ LIVE = Selection.of(
     gyro_scale=COMMON,
     distortion=FIRST,
 )
-# Deviations that the calibration of a recording estimates.
-OFFLINE = Selection.of(
-    'axes',
-    'time_offset',
-    'offset_per_interval',
-    'readout_time',
-    'gyro_bias',
-    'focal_log',
-    'principal_point',
-    'exposure_square',
-    distortion=FIRST,
-)
+# Deviations of the calibration of a recording: all. Those that it does not estimate are doubts.
+OFFLINE = Selection.of(*PARTS)
 
 
 def by_stamped_row(selection: Selection, share: float) -> Array:

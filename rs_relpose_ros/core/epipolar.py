@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import add, cross, dot, scale, Vector
+from rs_relpose_ros.geometry.so3 import add, copy_vector, cross, dot, scale, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
 
 # Square of the least gradient of e by the pixels, added to every square. A ray on the epipole has
@@ -106,6 +106,31 @@ def by_rays(first: View, second: View, baseline: Vector, at: Residual) -> tuple[
         ),
         View(cross(baseline, at.scaled_1), scale(c3, by_ray_2), scale(c4, by_ray_2)),
     )
+
+
+@inlined_kernel
+def write_constraint(first: View, second: View, out: Array) -> None:
+    """Write the vectors (5, 3) whose products with the baseline are e and the q_k, in this order.
+
+    With them, residuals of a match with many baselines cost five products each
+    (`square_at_baseline`).
+    """
+    copy_vector(cross(first.ray, second.ray), out[0])
+    copy_vector(cross(first.by_u, second.ray), out[1])
+    copy_vector(cross(first.by_v, second.ray), out[2])
+    copy_vector(cross(first.ray, second.by_u), out[3])
+    copy_vector(cross(first.ray, second.by_v), out[4])
+
+
+@inlined_kernel
+def square_at_baseline(constraint: Array, baseline: Vector) -> float:
+    """Square of the residual [px^2] by the vectors of `write_constraint`."""
+    e = dot(constraint[0], baseline)
+    square = LEAST_SQUARE
+    for k in range(1, 5):
+        q = dot(constraint[k], baseline)
+        square += q * q
+    return e * e / square
 
 
 class Derivatives(NamedTuple):

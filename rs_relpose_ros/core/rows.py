@@ -1,15 +1,20 @@
 """Orientation of the camera at the rows of a frame, and its derivatives by all deviations.
 
-A row is read the time tau after the reference row, a share s of the readout after the middle row.
 With A(u) the rotation by the gyro from the axes of the camera at time u to those at the reference
-row, ``A(0) = I``, deviations c rotate A(tau) on the left by
+of its path, and R_cam_imu from the axes of the IMU to those of the camera, deviations c of the
+configuration rotate A(t) on the left by
 
-    axes          (I - A(tau)) c
-    time_offset   (A(tau) w(tau) - w(0)) c          all rows are later on the clock of the gyro
-    readout_time  A(tau) w(tau) s c                 the row itself is later by s c
-    gyro_bias     -B c,             B = integral from 0 to tau of A(u) R_cam_imu du
-    gyro_scale, gyro_skew           integral of A(u) R_cam_imu M w_imu(u) du, M symmetric
+    axes          -A(t) c                      and by +c, which is common to all times
+    time_offset   A(t) w(t) c                  the row is later on the clock of the gyro
+    offset_per_interval                        the same times the covariate of the frame
+    readout_time  A(t) w(t) s c                the row, a share s of the readout after the middle
+                                               row, is later by s c
+    gyro_bias     -integral of A(u) R_cam_imu du c
+    gyro_scale, gyro_skew    integral of A(u) R_cam_imu M w_imu(u) du, M symmetric
+    exposure_square          integral of A(u) R_cam_imu v(u) du c, v the change of the rates
 
+Kernels add these turns, times the derivative of a residual by a turn, to the derivatives of the
+residual. Only turns relative to another time matter: those at the reference are subtracted.
 A deviation that is not named here, such as those of the lens, does not turn the rows.
 """
 
@@ -21,10 +26,133 @@ import numpy as np
 
 from rs_relpose_ros.core.deviations import N_DEVIATIONS, PARTS
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.gyro import GyroPath, path_states
+from rs_relpose_ros.geometry.gyro import GyroPath, knot_before, write_state
+from rs_relpose_ros.geometry.so3 import dot, rotated, rotated_back, Vector
+from rs_relpose_ros.jit import inlined_kernel, kernel
 
+# Places of the deviations in the whole vector, as numbers for the kernels.
+_AXES = PARTS['axes'].start
+_OFFSET = PARTS['time_offset'].start
+_SLOPE = PARTS['offset_per_interval'].start
+_READOUT = PARTS['readout_time'].start
+# Deviations of the rates of the gyro, which are neighbours in the whole vector: the first of
+# them, and their number.
+_GYRO = PARTS['gyro_bias'].start
+_N_GYRO = PARTS['exposure_square'].stop - _GYRO
+# Places among the deviations of the rates.
+_SCALE = PARTS['gyro_scale'].start - _GYRO
+_SKEW = PARTS['gyro_skew'].start - _GYRO
+_EXPOSURE = PARTS['exposure_square'].start - _GYRO
 # Pairs of axes of `gyro_skew`, in its order.
 _SKEWED = ((1, 2), (0, 2), (0, 1))
+
+
+class TurnedPath(NamedTuple):
+    """A path in the axes of the camera, and how G deviations of the gyro's rates turn it."""
+
+    path: GyroPath
+    # (K, 3, G) rotation vector at each knot, relative to the first knot, and its derivative by
+    # time.
+    turns: Array
+    turn_rates: Array
+
+
+def gyro_matrix(deviations: Array) -> Array:
+    """Matrix M (3, 3) of scale and skew: the true rates are ``(I + M) w``."""
+    matrix = np.diag(deviations[PARTS['gyro_scale']])
+    for (first, second), skew in zip(_SKEWED, deviations[PARTS['gyro_skew']], strict=True):
+        matrix[first, second] = matrix[second, first] = skew
+    return matrix
+
+
+@inlined_kernel
+def _write_turn_rates(
+    rotation: Array, R_cam_imu: Array, rate: Array, blur_rate: Array, out: Array
+) -> None:
+    """Write the derivatives (3, G) by time of the turns at one time."""
+    rate_imu = rotated_back(R_cam_imu, rate)
+    for i in range(3):
+        row = rotated_back(R_cam_imu, rotation[i])
+        for axis in range(3):
+            out[i, axis] = -row[axis]
+            out[i, _SCALE + axis] = row[axis] * rate_imu[axis]
+        for k, (first, second) in enumerate(_SKEWED):
+            out[i, _SKEW + k] = row[first] * rate_imu[second] + row[second] * rate_imu[first]
+        out[i, _EXPOSURE] = dot(row, blur_rate)
+
+
+@kernel
+def turned_path(path: GyroPath, R_cam_imu: Array, blur_rates: Array) -> TurnedPath:
+    """Integrate the turns of a path (Simpson's rule over each step of the gyro).
+
+    `blur_rates` (K, 3) are the derivatives of the rates of the IMU by the square of the exposure
+    [rad/s^3].
+    """
+    knots = len(path.times)
+    turns, turn_rates = np.zeros((knots, 3, _N_GYRO)), np.empty((knots, 3, _N_GYRO))
+    rotation, rate, blur_rate = np.empty((3, 3)), np.empty(3), np.empty(3)
+    of_middle = np.empty((3, _N_GYRO))
+    for k in range(knots):
+        _write_turn_rates(
+            path.rotations[k], R_cam_imu, path.rates[k], blur_rates[k], turn_rates[k]
+        )
+    for k in range(knots - 1):
+        step = path.times[k + 1] - path.times[k]
+        write_state(path, path.times[k] + 0.5 * step, k, rotation, rate)
+        for i in range(3):
+            blur_rate[i] = 0.5 * (blur_rates[k, i] + blur_rates[k + 1, i])
+        _write_turn_rates(rotation, R_cam_imu, rate, blur_rate, of_middle)
+        for i in range(3):
+            for g in range(_N_GYRO):
+                ends = turn_rates[k, i, g] + turn_rates[k + 1, i, g]
+                turns[k + 1, i, g] = turns[k, i, g] + step / 6.0 * (ends + 4.0 * of_middle[i, g])
+    return TurnedPath(path, turns, turn_rates)
+
+
+@inlined_kernel
+def add_by_gyro(J: Array, by_turn: Vector, turned: TurnedPath, time: float, k: int) -> None:
+    """Add the derivatives by the gyro's rates, at a time after knot `k`.
+
+    `by_turn` is the derivative of a residual by a turn of the camera at this time. The integral
+    within the step is the cubic polynomial through its values and its derivatives at the knots.
+    """
+    step = turned.path.times[k + 1] - turned.path.times[k]
+    s = (time - turned.path.times[k]) / step
+    of_end = s * s * (3.0 - 2.0 * s)
+    of_begin_rate = s * (1.0 - s) * (1.0 - s) * step
+    of_end_rate = -s * s * (1.0 - s) * step
+    for i in range(3):
+        begin, end = (1.0 - of_end) * by_turn[i], of_end * by_turn[i]
+        begin_rate, end_rate = of_begin_rate * by_turn[i], of_end_rate * by_turn[i]
+        for g in range(_N_GYRO):
+            J[_GYRO + g] += (
+                begin * turned.turns[k, i, g]
+                + end * turned.turns[k + 1, i, g]
+                + begin_rate * turned.turn_rates[k, i, g]
+                + end_rate * turned.turn_rates[k + 1, i, g]
+            )
+
+
+@inlined_kernel
+def add_by_axes(J: Array, by_turn: Vector, rotation: Array) -> None:
+    """Add the derivatives by the axes at a time with this rotation of the camera."""
+    by_axes = rotated_back(rotation, by_turn)
+    for axis in range(3):
+        J[_AXES + axis] -= by_axes[axis]
+
+
+@inlined_kernel
+def add_by_time(
+    J: Array, by_turn: Vector, rotation: Array, rate: Array, share: float, covariate: float
+) -> None:
+    """Add the derivatives by offset and readout time of a row, `share` after the middle row."""
+    by_time = dot(by_turn, rotated(rotation, rate))
+    J[_OFFSET] += by_time
+    J[_SLOPE] += covariate * by_time
+    J[_READOUT] += share * by_time
+
+
+# -- All rows of a frame --------------------------------------------------------------------------
 
 
 class RowStates(NamedTuple):
@@ -35,55 +163,36 @@ class RowStates(NamedTuple):
     time_by_deviation: Array  # (N, D) of tau [s]
 
 
+@kernel
 def row_states(path: GyroPath, R_cam_imu: Array, times: Array, shares: Array) -> RowStates:
     """Rows at `times` tau (N,) [s], which are `shares` (N,) of the readout after the middle row.
 
-    `path` is in camera axes, and relative to time 0.
+    `path` is in camera axes, and relative to time 0, which is the time of the reference row.
     """
-    rotations, rates, _ = path_states(path, times)
-    first_rate = path_states(path, np.zeros(1))[1][0]
-    by_rate, by_gyro = _integrals(path, R_cam_imu, times)
-    velocity = np.einsum('nij,nj->ni', rotations, rates)
-    turns = np.zeros((len(times), 3, N_DEVIATIONS))
-    turns[:, :, PARTS['axes']] = np.eye(3) - rotations
-    turns[:, :, PARTS['time_offset']] = (velocity - first_rate)[:, :, None]
-    turns[:, :, PARTS['readout_time']] = (velocity * shares[:, None])[:, :, None]
-    turns[:, :, PARTS['gyro_bias']] = -by_rate
-    turns[:, :, PARTS['gyro_scale']] = np.einsum('nijj->nij', by_gyro)
-    skewed = [by_gyro[:, :, i, j] + by_gyro[:, :, j, i] for i, j in _SKEWED]
-    turns[:, :, PARTS['gyro_skew']] = np.stack(skewed, axis=2)
-    delays = np.zeros((len(times), N_DEVIATIONS))
-    delays[:, PARTS['readout_time']] = shares[:, None]
+    count = len(times)
+    turned = turned_path(path, R_cam_imu, np.zeros(path.rates.shape))
+    rotations, turns = np.empty((count, 3, 3)), np.zeros((count, 3, N_DEVIATIONS))
+    delays, at_reference = np.zeros((count, N_DEVIATIONS)), np.zeros((3, N_DEVIATIONS))
+    _write_turns(turned, 0.0, 0.0, np.empty((3, 3)), at_reference)
+    for n in range(count):
+        _write_turns(turned, times[n], shares[n], rotations[n], turns[n])
+        for i in range(3):
+            for d in range(N_DEVIATIONS):
+                turns[n, i, d] -= at_reference[i, d]
+        delays[n, _READOUT] = shares[n]
     return RowStates(rotations, turns, delays)
 
 
-def _integrals(path: GyroPath, R_cam_imu: Array, times: Array) -> tuple[Array, Array]:
-    """Integrals from 0 to each time (N,): of ``A R_cam_imu``, and of that times each rate.
-
-    The first (N, 3, 3) [s] is by a rate, the second (N, 3, 3, 3) [rad] by the gyro's matrix: its
-    last two axes are those of the matrix. Simpson's rule over each step of the gyro, and a cubic
-    polynomial within it: to fourth order in the step.
-    """
-
-    def values(at: Array) -> Array:
-        rotations, rates, _ = path_states(path, at)
-        by_rate = rotations @ R_cam_imu
-        by_gyro = by_rate[:, :, :, None] * (rates @ R_cam_imu)[:, None, None, :]
-        return np.concatenate([by_rate.reshape(-1, 9), by_gyro.reshape(-1, 27)], axis=1)
-
-    knots, steps = path.times, np.diff(path.times)
-    of_knots = values(knots)
-    of_middles = values(0.5 * (knots[1:] + knots[:-1]))
-    of_steps = (of_knots[:-1] + 4.0 * of_middles + of_knots[1:]) / 6.0
-    whole = np.vstack([np.zeros(36), np.cumsum(steps[:, None] * of_steps, axis=0)])
-    ends = np.append(times, 0.0)
-    before = np.clip(np.searchsorted(knots, ends, side='right') - 1, 0, len(steps) - 1)
-    share = ((ends - knots[before]) / steps[before])[:, None]
-    # Integral, over the step, of the parabola through the values at begin, middle and end.
-    begin, middle, end = of_knots[before], of_middles[before], of_knots[before + 1]
-    linear = -3.0 * begin + 4.0 * middle - end
-    square = 2.0 * begin - 4.0 * middle + 2.0 * end
-    part = share * (begin + share * (linear / 2.0 + share * square / 3.0))
-    until = whole[before] + steps[before, None] * part
-    since = until[:-1] - until[-1]
-    return since[:, :9].reshape(-1, 3, 3), since[:, 9:].reshape(-1, 3, 3, 3)
+@kernel
+def _write_turns(
+    turned: TurnedPath, time: float, share: float, rotation: Array, turns: Array
+) -> None:
+    """Write the rotation at one time and add its turns (3, D) by all deviations."""
+    rate, axes = np.empty(3), np.eye(3)
+    k = knot_before(turned.path.times, time, 0)
+    write_state(turned.path, time, k, rotation, rate)
+    for i in range(3):
+        axis = (axes[i, 0], axes[i, 1], axes[i, 2])
+        add_by_axes(turns[i], axis, rotation)
+        add_by_time(turns[i], axis, rotation, rate, share, 0.0)
+        add_by_gyro(turns[i], axis, turned, time, k)

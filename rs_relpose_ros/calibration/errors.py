@@ -1,0 +1,285 @@
+"""Covariance of a calibration: noise, and errors that a fit to one recording cannot average out.
+
+Steps 2 to 4 of docs/calibration.md, "Method": noise of matches by a jackknife over stretches of
+time; errors that regions of the image share (two-way clustering: A. C. Cameron, J. B. Gelbach,
+D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the recording do not share
+(R. T. Birge, Phys. Rev. 40, 1932); doubts of parameters that are not estimated.
+"""
+
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special  # scipy.stats takes seconds to import, at the start of a node
+
+from rs_relpose_ros.calibration import model
+from rs_relpose_ros.calibration.fit import (
+    evaluate,
+    evaluation,
+    Fit,
+    Flags,
+    minimised,
+    normal_equations,
+    sums_of,
+)
+from rs_relpose_ros.calibration.model import GLOBAL, Problem, ROTATION, Unknowns
+from rs_relpose_ros.core.least_squares import (
+    adjusted_scores,
+    grouped_covariance,
+    inverse,
+    JACKKNIFE,
+)
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.so3 import log_so3
+
+# -- Noise of the matches -------------------------------------------------------------------------
+
+# Length of a stretch [s]. Errors may be correlated within one: tracks live for about a second.
+# [chosen: shorter stretches would share tracks, longer ones leave few groups]
+_STRETCH = 1.0
+# Least number of stretches. The scatter of fewer groups is hardly known.
+# [chosen: Student's t of 9 degrees of freedom widens by 6 %]
+_LEAST_STRETCHES = 10
+# Largest number of stretches. More cost time and change nothing.
+# [chosen: the scatter of 30 groups is known to 13 %]
+_MOST_STRETCHES = 30
+# Least duration [s] that times are divided by, of pairs at one time.
+# [chosen: any value below the interval of frames would do]
+_LEAST_DURATION = 1e-9
+# Multiple of the Newton step that is left, which the sigmas of a fit that has not converged
+# contain. [chosen: that by which steps are extended at most]
+_OF_LEFT = 8.0
+
+
+def fit(
+    problem: Problem,
+    unknowns: Unknowns,
+    free: Flags,
+    *,
+    rounds: int = 60,
+    tolerance: float = 0.05,
+) -> Fit:
+    """`minimised`, with the covariance by the noise of the matches.
+
+    After `rounds` the sigmas contain what may be left to the optimum.
+    """
+    found = minimised(problem, unknowns, free, rounds=rounds, tolerance=tolerance)
+    at, prior = found.evaluation, problem.prior[found.block]
+    of_free = jackknife(
+        at.score, bent(found.weights) * at.reduced, stretches(problem.middles), prior
+    )
+    if not found.converged:
+        of_free += _OF_LEFT**2 * np.outer(found.left, found.left)
+    covariance = np.zeros((GLOBAL, GLOBAL))
+    covariance[found.block] = of_free
+    return replace(found, covariance=covariance)
+
+
+def stretches(times: Array) -> NDArray[np.int64]:
+    """Stretch (P,) of the recording that each time (P,) [s] belongs to."""
+    begin, duration = times.min(), max(float(np.ptp(times)), _LEAST_DURATION)
+    count = int(np.clip(duration / _STRETCH, _LEAST_STRETCHES, _MOST_STRETCHES))
+    numbers = ((times - begin) / duration * count).astype(np.int64)
+    return np.minimum(numbers, count - 1)
+
+
+def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior: Array) -> Array:
+    """Covariance (k, k) by deleting a group each: one Newton step from the optimum.
+
+    Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the few
+    groups (B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). `scores`
+    (P, k): gradients of the cost by pair; `curvatures` (P, k, k): their derivatives; `prior`
+    (k, k): information that counts as known.
+    """
+    names = np.unique(groups)
+    sums = np.stack([scores[groups == name].sum(axis=0) for name in names])
+    of_groups = np.stack([curvatures[groups == name].sum(axis=0) for name in names])
+    # Scores add up to the pull of the prior, which is no scatter.
+    scatter = math.sqrt(_of_few_groups(len(names))) * (sums - sums.mean(axis=0))
+    return np.asarray(grouped_covariance(scatter, of_groups, prior, JACKKNIFE))
+
+
+def _of_few_groups(count: int) -> float:
+    """Factor of the variance of a jackknife over a number of groups.
+
+    The scatter of few groups is uncertain, so that errors in sigmas follow Student's t: widened,
+    one sigma has the coverage of a normal deviate.
+    """
+    wider = special.stdtrit(count - 1, special.ndtr(1.0)) ** 2
+    return float(wider * (count - 1) / count)
+
+
+def bent(weights: Array) -> float:
+    """Curvature of the loss, all (N,) matches, over the weight of Gauss-Newton."""
+    return float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
+
+
+# -- Errors beyond the noise of the matches -------------------------------------------------------
+
+# Regions of the image: columns and rows of equally many points. More regions have too few points
+# to scatter by more than noise, fewer hide a local error. [chosen: as the regions of a pair]
+_COLUMNS = 4
+_ROWS = 3
+# Mean squared difference, in sigmas, of the parameters of two halves that is chance.
+# [derived: the 95 % quantile of chi-square over its degrees of freedom, for the ten to twelve
+# parameters of a fit, is 1.75 to 1.83]
+_CHANCE = 1.75
+# Squared difference of one parameter that is no chance. [chosen: 3 sigmas]
+_GROSS = 9.0
+# Rounds of the fit of each half, from the optimum of the whole.
+# [chosen: a fit of a half takes five to ten]
+_HALF_ROUNDS = 15
+
+
+def widened(final: Fit, doubts: Array | None = None) -> Fit:
+    """The fit with a covariance of all errors, not only the noise of the matches.
+
+    `doubts` (GLOBAL,) are sigmas of parameters that the fit holds; zero where there is no doubt.
+    """
+    wider = np.sqrt(_between_regions(final) * _disagreement(final))
+    scatter = final.covariance * np.outer(wider, wider)
+    if doubts is not None:
+        scatter[final.block] += _of_doubts(final, doubts)
+    return replace(final, covariance=scatter)
+
+
+def _of_doubts(final: Fit, doubts: Array) -> Array:
+    """Covariance (k, k) of the free parameters by the doubts of others."""
+    doubted = (doubts > 0.0) & ~final.free
+    both = final.free | doubted
+    at = evaluate(final.problem, final.unknowns, both)
+    H, _ = normal_equations(final.problem, at, final.unknowns, both)
+    is_free = final.free[both]
+    moves = np.linalg.solve(H[np.ix_(is_free, is_free)], H[np.ix_(is_free, ~is_free)])
+    moves = moves * doubts[doubted]
+    return np.asarray(moves @ moves.T)
+
+
+def _between_regions(final: Fit) -> Array:
+    """Factors (GLOBAL,) of the variances by the scatter of regions beyond that of cells.
+
+    Cells are regions of the image times stretches of time: if the regions scatter no more than
+    these, the scatter of the stretches is complete.
+    """
+    problem, unknowns, free = final.problem, final.unknowns, final.free
+    region, stretch = _regions(problem.points[0]), stretches(problem.middles)
+    sums = sums_of(problem, unknowns, free)
+    whole, curve = evaluation(problem, unknowns, sums), bent(final.weights)
+    scores, curvatures, cells = [], [], []
+    for name in np.unique(region):
+        of_region = sums_of(problem.matches(region == name), unknowns, free)
+        others = sums._replace(
+            gradient=sums.gradient - of_region.gradient,
+            hessian=sums.hessian - of_region.hessian,
+        )
+        rest = evaluation(problem, unknowns, others)
+        own = whole.score - rest.score
+        scores.append(own.sum(axis=0))
+        curvatures.append(curve * (whole.reduced - rest.reduced).sum(axis=0))
+        cells += [own[stretch == k].sum(axis=0) for k in np.unique(stretch)]
+    H = curve * whole.reduced.sum(axis=0) + problem.prior[final.block]
+    adjusted = adjusted_scores(np.array(scores), np.array(curvatures), H, JACKKNIFE)
+    of_regions = adjusted.T @ adjusted * _of_few_groups(len(adjusted))
+    of_cells = np.transpose(cells) @ np.array(cells)
+    covariance = inverse(H)
+    beyond = np.diag(covariance @ (of_regions - of_cells) @ covariance)
+    factors = np.ones(GLOBAL)
+    factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
+    return factors
+
+
+def _regions(points: Array) -> NDArray[np.int64]:
+    """Region (N,) of the image of each point (N, 2): columns and rows of equally many points."""
+
+    def band(values: Array, count: int) -> NDArray[np.int64]:
+        borders = np.quantile(values, np.arange(1, count) / count)
+        return np.searchsorted(borders, values)
+
+    return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
+
+
+def _disagreement(final: Fit) -> Array:
+    """Factors (GLOBAL,) of the variances by the difference of both halves; 1 if it is chance."""
+    middles, free = final.problem.middles, final.free
+    first = middles < np.median(middles)
+    one, other = (
+        fit(
+            final.problem.pairs_of(part),
+            final.unknowns.pairs_of(part),
+            free,
+            rounds=_HALF_ROUNDS,
+        )
+        for part in (first, ~first)
+    )
+    difference = one.unknowns.parameters - other.unknowns.parameters
+    turn = one.unknowns.R_cam_imu @ other.unknowns.R_cam_imu.T
+    difference[ROTATION] = log_so3(np.ascontiguousarray(turn))
+    # The whole lets expect four times its own; less than half of that is chance, of few stretches.
+    expected = np.diag(one.covariance + other.covariance)
+    variances = np.maximum(expected, 2.0 * np.diag(final.covariance))
+    squares = difference[free] ** 2 / variances[free]
+    mean = float(np.minimum(squares, _GROSS).mean())
+    of_all = mean if mean > _CHANCE else 1.0
+    factors = np.ones(GLOBAL)
+    factors[free] = np.maximum(of_all, np.where(squares > _GROSS, squares, 1.0))
+    return factors
+
+
+# -- Doubts of parameters that are not estimated --------------------------------------------------
+
+# 1 sigma each. [chosen: what a calibration of a lens by a target, and data sheets of MEMS gyros
+# after the compensation of the manufacturer, leave]
+_FOCAL_DOUBT = 0.005
+# Ratio of the two focal lengths: pixels are square.
+_ASPECT_DOUBT = 0.002
+# Principal point, as a share of the width of the image.
+_CENTER_DOUBT = 0.005
+# First coefficient of a given distortion.
+_RADIAL_DOUBT = 0.02
+# Second coefficient, where the first one is estimated.
+_SECOND_DOUBT = 0.02
+# Scale of each axis of the gyro.
+_SCALE_DOUBT = 0.005
+# Skew between each two axes of the gyro [rad].
+_SKEW_DOUBT = 0.005
+
+
+def doubts(width: int, *, lens_known: bool) -> Array:
+    """Sigmas (GLOBAL,) of the parameters of lens and gyro that a fit does not estimate.
+
+    `width` is that of the image [px].
+    """
+    sigmas = np.zeros(GLOBAL)
+    sigmas[model.ASPECT] = _ASPECT_DOUBT
+    sigmas[model.SCALE] = _SCALE_DOUBT
+    sigmas[model.SKEW] = _SKEW_DOUBT
+    if lens_known:
+        sigmas[model.FOCAL] = _FOCAL_DOUBT
+        sigmas[model.CENTER] = _CENTER_DOUBT * width
+        sigmas[model.RADIAL] = _RADIAL_DOUBT
+    else:
+        sigmas[model.RADIAL + 1] = _SECOND_DOUBT
+    return sigmas
+
+
+# -- Use of a calibration -------------------------------------------------------------------------
+
+# Largest sigma of the direction of motion of a pair by the noise of its matches [rad]: beyond it a
+# pair nearly without motion would hide any doubt. [chosen: 6 deg]
+_KNOWN_DIRECTION = 0.1
+
+
+def move_of_poses(final: Fit, covariance: Array) -> float:
+    """Move of the direction of the median pair by the doubt of the parameters, over its sigma."""
+    at = final.evaluation
+    lower = at.own.transpose(2, 0, 1)
+    own = np.linalg.inv(lower + np.tril(lower, -1).transpose(0, 2, 1))[:, :2, :2]
+    back = at.back[:-1, :2].transpose(2, 1, 0)
+    moved = back @ covariance[final.block] @ back.transpose(0, 2, 1)
+
+    def median_size(of_pairs: NDArray[Any]) -> float:
+        return float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
+
+    return median_size(moved) / min(median_size(own), _KNOWN_DIRECTION)
