@@ -334,7 +334,14 @@ def test_a_broken_recording_has_its_finding(case, tmp_path):
     assert report.failed == any(f.state is F for f in report.findings)
     json.dumps(report.to_mapping(), allow_nan=False)
     assert len(report.lines(80)) > len(findings)
-    assert max(map(len, report.lines(100)[:-1])) <= 100  # the last one has the path
+    first = report.lines(80)[0]
+    assert first == report.to_mapping()['verdict']
+    assert ('cannot be used' in first) == report.failed
+    causes = [one for one in report.findings if one.finding.parent is None]
+    assert found.finding.parent is None or found.finding.parent in {one.code for one in causes}
+    if report.failed:
+        assert first.endswith(next(one.text for one in causes if one.state is F))
+    assert max(map(len, report.lines(100)[1:-1])) <= 100  # the first and the last have the path
 
 
 @pytest.mark.parametrize('changes', [{'info': uncalibrated}, {'info_topic': ''}])

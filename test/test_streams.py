@@ -15,7 +15,12 @@ from rs_relpose_lab.simulation.simulation import simulate
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.cli import main
-from rs_relpose_ros.messages.streams import counter_unit, find_bursts, true_rate
+from rs_relpose_ros.messages.streams import (
+    counter_unit,
+    find_bursts,
+    find_multiplied,
+    SensorRate,
+)
 
 IMU, IMAGES = '/imu/data_raw', '/camera/image_raw/compressed'
 SECOND = 10**9
@@ -208,14 +213,22 @@ def test_units_of_counters():
     assert counter_unit(3.0, 0.033) == ''
 
 
-def test_true_rate_of_multiplied_values():
+def test_multiplied_values_have_their_factor():
     rng = np.random.default_rng(3)
     turning = np.sin(np.arange(500)[:, None] * 0.05 + np.arange(3)) + rng.normal(0, 2e-3, (500, 3))
-    assert true_rate(200.0, turning) is None
-    assert true_rate(200.0, np.round(turning[:60] * 0.01, 2)) is None  # coarse, nearly at rest
-    rate, how = true_rate(200.0, np.repeat(turning, 4, axis=0))
-    assert how == 'repeated' and rate == pytest.approx(50.0, rel=0.02)
+    assert find_multiplied(turning) is None
+    assert find_multiplied(np.round(turning[:60] * 0.01, 2)) is None  # coarse, nearly at rest
+    held = np.repeat(turning, 4, axis=0)
+    factor, how = find_multiplied(held)
+    assert how == 'repeated' and factor == pytest.approx(4.0, rel=0.02)
     at = np.arange(0.0, 499.0, 0.25)
     lines = np.stack([np.interp(at, np.arange(500), column) for column in turning.T], axis=1)
-    rate, how = true_rate(200.0, lines.astype(np.float32))
-    assert how == 'interpolated' and rate == pytest.approx(50.0, rel=0.02)
+    factor, how = find_multiplied(lines.astype(np.float32))
+    assert how == 'interpolated' and factor == pytest.approx(4.0, rel=0.02)
+    rate, changes = SensorRate(), 0
+    for number, one in enumerate((*turning[:200].tolist(), *held[:800].tolist())):
+        changes += rate.add(number * 5_000_000, tuple(one))
+    assert rate.factor == 4.0 and changes == 1
+    # The bends of a sine of 0.05 rad a sample, and of its noise.
+    bend = 0.5 * 0.05**4 + 6 * 2e-3**2
+    assert rate.between == pytest.approx(0.02 * bend / 144, rel=0.3)

@@ -10,14 +10,14 @@ from pathlib import Path
 import re
 import subprocess
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_relpose_lab.field.cases import Case
-from rs_relpose_lab.field.recording import FieldRecording
+from rs_relpose_lab.field.recording import FieldRecording, Stamps
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.geometry import Array, so3
 
@@ -190,6 +190,14 @@ def calibration_sigmas(recording: FieldRecording, folder: Path) -> dict[str, flo
     return errors
 
 
+class _Pose(NamedTuple):
+    """Poses of the camera in the world of a path, at stamps of the camera's clock."""
+
+    stamps_ns: Stamps  # (N,)
+    positions: Array  # (N, 3) [m]
+    rotations: Rotation  # (N,)
+
+
 def state_distances(recording: FieldRecording, folder: Path) -> Array:
     """Squared Mahalanobis distances (N, 2) of position and rotation of odometry.csv."""
     path = folder / 'odometry' / 'odometry.csv'
@@ -197,32 +205,59 @@ def state_distances(recording: FieldRecording, folder: Path) -> Array:
         return np.zeros((0, 2))
     with path.open(newline='') as file:
         rows = list(csv.DictReader(file))
+    smoothed = _smoothed(folder / 'odometry' / 'trajectory_smoothed.tum')
     out: list[tuple[float, float]] = []
     for number in sorted({row['path'] for row in rows}):
         part = [row for row in rows if row['path'] == number]
-        out += _path_distances(recording, part)
+        out += _path_distances(recording, part, smoothed)
     return np.reshape(out, (-1, 2))
 
 
+def _smoothed(path: Path) -> _Pose:
+    """Poses of trajectory_smoothed.tum: stamp [s], position, quaternion."""
+    lines = path.read_text(encoding='utf-8').split('\n') if path.exists() else []
+    words = [line.split() for line in lines if line]
+    stamps = [int(one[0].replace('.', '')) for one in words]  # of nine decimals
+    values = np.array([[float(word) for word in one[1:]] for one in words]).reshape(-1, 7)
+    rotations = Rotation.from_quat(values[:, 3:] if len(values) else np.eye(4)[3:])
+    return _Pose(np.array(stamps, dtype=np.int64), values[:, :3], rotations)
+
+
+def _true_ns(recording: FieldRecording, stamps_ns: Stamps) -> Stamps:
+    """True times of stamps on the camera's clock, which are interpolated between images."""
+    shots = sorted(recording.shots, key=lambda shot: shot.stamp_ns)
+    stamps = np.array([shot.stamp_ns for shot in shots])
+    true = np.array([shot.true_ns for shot in shots])
+    since = np.interp(stamps_ns - stamps[0], stamps - stamps[0], true - stamps[0])
+    return np.asarray(stamps[0] + since.astype(np.int64), dtype=np.int64)
+
+
+# Keyframes further apart [ns] belong to two paths. [chosen: the longest interval of keyframes is
+# 1 s; any value from there to the time of a loss would do]
+_OTHER_PATH_NS = 2_000_000_000
+
+
+def _begin(stamps_ns: Stamps, number: int) -> int:
+    """Number of the first keyframe of the path that keyframe `number` belongs to."""
+    while number and stamps_ns[number] - stamps_ns[number - 1] <= _OTHER_PATH_NS:
+        number -= 1
+    return number
+
+
 def _path_distances(
-    recording: FieldRecording, rows: list[dict[str, str]]
+    recording: FieldRecording, rows: list[dict[str, str]], smoothed: _Pose
 ) -> list[tuple[float, float]]:
-    """The same of one path, aligned in position and heading at its first state."""
-    true_stamps = np.array([shot.true_ns for shot in recording.shots])
+    """Return the same of one path.
+
+    Its world has the origin in the first smoothed keyframe, which all states relate to; the path
+    is aligned there with the truth, in position and heading.
+    """
     stamps = np.array([shot.stamp_ns for shot in recording.shots])
-    order = np.argsort(stamps)
     own = np.array([int(row['stamp_ns']) for row in rows])
-    # States are stamped on the camera's clock: their true time is interpolated between images.
-    at = np.interp(
-        own - stamps[order][0],
-        stamps[order] - stamps[order][0],
-        true_stamps[order] - stamps[order][0],
-    )
     inside = (own >= stamps.min()) & (own <= stamps.max())
     if inside.sum() < 2:
         return []
-    at_ns = (stamps[order][0] + at[inside].astype(np.int64)).astype(np.int64)
-    states = recording.states(at_ns)
+    states = recording.states(_true_ns(recording, own[inside]))
     R_true = states.R_world_cam @ recording.R_camera_image
     values = {
         name: np.array([float(row[name]) for row in rows])[inside]
@@ -233,9 +268,20 @@ def _path_distances(
     ).reshape(-1, 6, 6)[inside]
     R = Rotation.from_quat(np.stack([values[n] for n in ('qx', 'qy', 'qz', 'qw')], axis=1))
     position = np.stack([values[n] for n in 'xyz'], axis=1)
-    first = R.as_matrix()[0] @ R_true[0].T
-    heading = Rotation.from_euler('z', np.arctan2(first[1, 0], first[0, 0])).as_matrix()
-    moved = position[0] + (states.position - states.position[0]) @ heading.T
+    origin = _Pose(own[inside][:1], position[:1], R[:1])
+    before = np.flatnonzero(smoothed.stamps_ns <= own[0])
+    if len(before):
+        begin = _begin(smoothed.stamps_ns, int(before[-1]))
+        origin = _Pose(
+            smoothed.stamps_ns[begin : begin + 1],
+            smoothed.positions[begin : begin + 1],
+            smoothed.rotations[begin : begin + 1],
+        )
+    at_origin = recording.states(_true_ns(recording, origin.stamps_ns))
+    R_origin = at_origin.R_world_cam[0] @ recording.R_camera_image
+    turn = origin.rotations.as_matrix()[0] @ R_origin.T
+    heading = Rotation.from_euler('z', np.arctan2(turn[1, 0], turn[0, 0])).as_matrix()
+    moved = origin.positions[0] + (states.position - at_origin.position[0]) @ heading.T
     error_R = (Rotation.from_matrix(heading @ R_true) * R.inv()).as_rotvec()
     error_p = moved - position
     out = []

@@ -5,7 +5,7 @@ A bag that is damaged, truncated or far too large raises an InputError with one 
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
 import functools
 import logging
@@ -114,6 +114,7 @@ class _TopicFinder:
     bag: Path
     topics: Sequence[Topic]
     names: Mapping[str, str]  # those chosen, by role
+    first_message: Callable[[Topic], Any]  # None where it cannot be read
     complete: bool = True  # whether an absent topic is an error
 
     def find(self, needs_camera_info: bool) -> Chosen:
@@ -187,12 +188,10 @@ class _TopicFinder:
         """Topics of the gyro, and of a separate accelerometer."""
         accel = self._chosen('accel', IMU)
         candidates = self._of_type(IMU)
-        if not (self.names.get('imu') or accel) and len(candidates) == 2:
-            gyros, accels = (
-                [topic for topic in candidates if word in topic.name] for word in ('gyro', 'accel')
-            )
-            if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
-                return gyros[0], accels[0]
+        if not (self.names.get('imu') or accel) and len(candidates) > 1:
+            pair = self._pair_by_name(candidates) or self._pair_by_content(candidates)
+            if pair is not None:
+                return pair
         return self.one(
             'imu',
             'IMU',
@@ -200,6 +199,33 @@ class _TopicFinder:
             without=accel,
             hint=' (and --accel-topic for a separate accelerometer)',
         ), accel
+
+    @staticmethod
+    def _pair_by_name(candidates: Sequence[Topic]) -> tuple[Topic, Topic] | None:
+        """The topics of gyro and accelerometer by the words in their names."""
+        gyros, accels = (
+            [topic for topic in candidates if word in topic.name] for word in ('gyro', 'accel')
+        )
+        is_pair = len(candidates) == 2 and len(gyros) == len(accels) == 1 and gyros != accels
+        return (gyros[0], accels[0]) if is_pair else None
+
+    def _pair_by_content(self, candidates: Sequence[Topic]) -> tuple[Topic, Topic] | None:
+        """The only topic with a gyro alone and the only one with an accelerometer alone.
+
+        By REP-145 a covariance whose first element is -1 means that the sensor does not exist.
+        """
+        gyros: list[Topic] = []
+        accels: list[Topic] = []
+        for topic in candidates:
+            message = self.first_message(topic)
+            if message is None:
+                return None
+            has_gyro = message.angular_velocity_covariance[0] != -1.0
+            has_accel = message.linear_acceleration_covariance[0] != -1.0
+            if has_gyro == has_accel:
+                return None
+            (gyros if has_gyro else accels).append(topic)
+        return (gyros[0], accels[0]) if len(gyros) == len(accels) == 1 else None
 
     def _of_type(self, *msgtypes: str) -> list[Topic]:
         return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
@@ -339,7 +365,7 @@ class Bag:
         CameraInfo topics, that next to the image is used, and of two Imu topics one with 'gyro'
         and one with 'accel' in its name make a pair (RealSense).
         """
-        finder = _TopicFinder(self.path, self.topics, names or {})
+        finder = _TopicFinder(self.path, self.topics, names or {}, self._first_message)
         found = finder.find(needs_camera_info)
         assert found.image is not None and found.imu is not None
         truth = finder.one('truth', 'ground truth', POSE_STAMPED, preferred=GROUND_TRUTH_TOPIC)
@@ -347,7 +373,14 @@ class Bag:
 
     def choose_topics(self, names: Mapping[str, str]) -> Chosen:
         """The same, but None for those that are absent; a rectified image is chosen, too."""
-        return _TopicFinder(self.path, self.topics, names, complete=False).find(False)
+        finder = _TopicFinder(self.path, self.topics, names, self._first_message, complete=False)
+        return finder.find(False)
+
+    def _first_message(self, topic: Topic) -> Any:
+        """The first message of a topic; None if it cannot be read."""
+        with suppress(InputError):
+            return next((one.message for one in self.messages([topic])), None)
+        return None
 
     def messages(self, topics: Sequence[Topic], *, by_stamp: bool = False) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of `raw_messages`, with arrays that are read-only."""

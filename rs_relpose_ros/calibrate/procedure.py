@@ -526,6 +526,10 @@ _FOCAL_GUESS = 0.8
 _KEPT, _RENEWED_AFTER = 0.8, 30
 # The gyro is kept for longer than the images [ns], as the clocks may differ.
 _MARGIN_NS = to_nanoseconds(1.0)
+# A driver repeats the last sample for at most this time [ns]. A gyro that gives equal values for
+# longer is one of a simulation at rest, whose samples are kept. [chosen: the largest gap that is
+# interpolated, 30 ms; above the period of a slow sensor, 20 ms]
+_LONGEST_HELD_NS = to_nanoseconds(0.03)
 
 _logger = logging.getLogger(__name__)
 
@@ -610,6 +614,7 @@ class Recorder:
         self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
         self.size = (0, 0)  # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
+        self._last_sample: tuple[int, tuple[float, ...]] = (0, ())  # of those that are kept
 
     @property
     def seconds(self) -> float:
@@ -632,7 +637,7 @@ class Recorder:
                 self.intrinsics = value
             elif value.angular_velocity is None:
                 raise MissingInputError('an IMU message has no gyro')
-            else:
+            elif not self._is_held(value.stamp_ns, value.angular_velocity):
                 self._gyro.setdefault(value.stamp_ns, value.angular_velocity)
         except RsRelposeError as error:
             # Without a calibration the focal length is guessed.
@@ -641,6 +646,14 @@ class Recorder:
                 return None
             return error
         return None
+
+    def _is_held(self, stamp_ns: int, rates: tuple[float, float, float]) -> bool:
+        """Whether a driver has repeated the last sample; its stamp would make the gyro late."""
+        since_ns = stamp_ns - self._last_sample[0]
+        if rates == self._last_sample[1] and 0 <= since_ns < _LONGEST_HELD_NS:
+            return True
+        self._last_sample = stamp_ns, rates
+        return False
 
     def follow(self, encoded: EncodedImage) -> None:
         """Track the points of the images before in another one; InputError if it is unusable."""

@@ -29,7 +29,8 @@ from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.messages.transforms import bag_frames, BagFrames, extrinsics
-from rs_relpose_ros.offline.check import check_bag, CheckReport
+from rs_relpose_ros.offline.check import check_bag
+from rs_relpose_ros.offline.check_report import CheckReport
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.output_files import (
     json_text,

@@ -5,6 +5,7 @@ region of interest that the camera matrix has counted already. What has one poss
 read with it, and a warning names the field once; what has none is an error.
 """
 
+from collections.abc import Callable
 import functools
 import logging
 from typing import Any
@@ -42,8 +43,19 @@ _TILTED = 14
 _OFF_CENTRE = 0.2
 
 
-def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a CameraInfo, region of interest and binning included; MissingInputError."""
+Warn = Callable[[str], object]
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_once(text: str) -> None:
+    _logger.warning('%s', text)
+
+
+def intrinsics_from_info(msg: Any, warn: Warn = _warn_once) -> Intrinsics:
+    """Intrinsics of a CameraInfo, region of interest and binning included; MissingInputError.
+
+    `warn` gets a text on a region or a binning that contradicts size and camera matrix.
+    """
     k = _floats(msg, 'k')
     if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
@@ -54,7 +66,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     images.check_image_size(int(msg.width), int(msg.height))
     model, distortion = lens_of(str(msg.distortion_model)[:40], tuple(_floats(msg, 'd')))
     return Intrinsics(
-        **_part_of_sensor(msg, pinhole['cx'], pinhole['cy']),
+        **_part_of_sensor(msg, pinhole['cx'], pinhole['cy'], warn),
         **pinhole,
         distortion_model=model,
         distortion=distortion,
@@ -70,7 +82,7 @@ def info_field(msg: Any, name: str) -> Any:
     return getattr(msg, name if hasattr(msg, name) else name.upper())
 
 
-def _part_of_sensor(msg: Any, cx: float, cy: float) -> dict[str, int]:
+def _part_of_sensor(msg: Any, cx: float, cy: float, warn: Warn) -> dict[str, int]:
     """Sizes of sensor and image, region and binning, for `Intrinsics`.
 
     The principal point (cx, cy) [px] shows whether the camera matrix is that of the sensor, as
@@ -86,14 +98,14 @@ def _part_of_sensor(msg: Any, cx: float, cy: float) -> dict[str, int]:
     of_sensor = _is_central(cx, width) and _is_central(cy, height)
     binned = width // binning_x, height // binning_y
     if whole and (x_offset or y_offset) and of_sensor:
-        _warn_once(
+        warn(
             f'CameraInfo has a region of interest at ({x_offset}, {y_offset}) with the size of '
             f'the whole image, {width}x{height}: size and camera matrix are taken as those of '
             'the region; have the driver clear roi, or set the size of the sensor'
         )
         x_offset = y_offset = 0
     elif whole and not of_sensor and _is_central(cx, binned[0]) and _is_central(cy, binned[1]):
-        _warn_once(
+        warn(
             f'CameraInfo has a binning of {binning_x}x{binning_y} and a size of {width}x{height}, '
             f'but its principal point ({cx:.1f}, {cy:.1f}) is that of the image of '
             f'{binned[0]}x{binned[1]}: the camera matrix is taken as that of the image; have the '
@@ -152,8 +164,3 @@ def lens_of(model: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[flo
     if name != _POLYNOMIAL and given == _PLUMB_BOB:
         return name, coefficients + (0.0,) * (_RATIONAL - given)
     return name, coefficients
-
-
-@functools.lru_cache(maxsize=64)
-def _warn_once(text: str) -> None:
-    _logger.warning('%s', text)

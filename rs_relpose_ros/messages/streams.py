@@ -200,11 +200,15 @@ _LARGEST_FACTOR = 8
 _MOST = 0.9
 
 
-def true_rate(rate: float, values: Array) -> tuple[float, str] | None:
-    """Return the rate [Hz] of the sensor behind values (N, 3), and how they were multiplied.
+class Multiplied(NamedTuple):
+    """Samples of a sensor that its driver has multiplied."""
 
-    None if each message has a sample of its own. `rate` is that of the messages.
-    """
+    factor: float  # messages for each sample of the sensor
+    how: str  # 'repeated' or 'interpolated'
+
+
+def find_multiplied(values: Array) -> Multiplied | None:
+    """Return how the values (N, 3) of messages were multiplied; None for a sample in each."""
     if len(values) < _FEWEST_STEPS or not np.ptp(values, axis=0).any():
         return None
     steps = np.diff(values, axis=0)
@@ -216,8 +220,44 @@ def true_rate(rate: float, values: Array) -> tuple[float, str] | None:
         new = len(multiplied) - int(multiplied.sum())
         factor = len(multiplied) / max(new, 1)
         if 1.5 <= factor <= _LARGEST_FACTOR and _is_regular(multiplied, round(factor)):
-            return rate / factor, how
+            return Multiplied(factor, how)
     return None
+
+
+# Error of the mean of an interval that is interpolated between its ends, in units of the second
+# difference of the samples there. [derived: the trapezoidal rule]
+_TRAPEZOID = 1.0 / 12.0
+
+
+class SensorRate:
+    """How many messages the samples of a gyro make, message by message."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=_WINDOW)
+        self._rates: deque[tuple[float, float, float]] = deque(maxlen=_WINDOW)
+        self._count = 0
+        # Messages for each sample of the sensor; 1 until it is known.
+        self.factor = 1.0
+        # Density [rad^2/s] of the errors between samples that were multiplied.
+        self.between = 0.0
+
+    def add(self, stamp_ns: int, rates: tuple[float, float, float]) -> bool:
+        """Add the values of a message; whether the factor has changed."""
+        self._stamps.append(stamp_ns)
+        self._rates.append(rates)
+        self._count += 1
+        if self._count % _EVERY:
+            return False
+        values = np.array(self._rates)
+        found = find_multiplied(values)
+        factor = 1 if found is None else round(found.factor)
+        changed, self.factor = factor != self.factor, float(factor)
+        self.between = 0.0
+        if factor > 1:
+            step = float(np.median(np.diff(self._stamps))) / NANOSECONDS
+            bends = np.diff(values[::factor], n=2, axis=0)
+            self.between = factor * step * _TRAPEZOID**2 * float(np.mean(bends**2))
+        return changed
 
 
 def _is_regular(multiplied: NDArray[np.bool_], factor: int) -> bool:

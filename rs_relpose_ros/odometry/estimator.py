@@ -22,6 +22,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nano
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import StuckGyro
 from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.messages.streams import SensorRate
 from rs_relpose_ros.odometry.doubts import Doubts, UNKNOWN_ARM
 from rs_relpose_ros.odometry.graph import (
     ARM,
@@ -221,6 +222,7 @@ class OdometryEstimator:
             self.base = None if place is None else Base.of(self._config.base_frame, place)
         self._samples = ImuSamples(parameters.imu.max_imu_gap)
         self._gyro = StuckGyro(parameters.imu.stuck_gyro_time)
+        self._sensor_rate = SensorRate()
         self._camera = ''  # frame_id of the pairs
         self._waiting: dict[int, PublishedPair] = {}
         self._run: _Run | None = None
@@ -289,6 +291,7 @@ class OdometryEstimator:
             self._waiting, self._last_ns = {}, None
         elif too_late:
             return  # for any pair
+        self._watch_rate(sample)
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
         if sample.stamp_ns < self._watched_ns + _WATCH_NS:
@@ -300,6 +303,12 @@ class OdometryEstimator:
             self._watch(sample.stamp_ns)
         except GraphError as error:
             self._end(str(error), sample.stamp_ns)
+
+    def _watch_rate(self, sample: ImuSample) -> None:
+        """Find out whether the driver multiplies samples, whose noise is then larger."""
+        rates, known = sample.angular_velocity, self._sensor_rate
+        if rates is not None and known.add(sample.stamp_ns, rates) and self._run is not None:
+            self._run.graph.use_sensor_rate(known.factor, known.between)
 
     def imu_is_silent(self, seconds: float) -> None:
         """Tell that no sample has come for some time; the next ones decide whether it is a gap."""
@@ -634,6 +643,7 @@ class OdometryEstimator:
         path_end = self._path_end_at(pair.reference_imu_ns)
         start = self._start(pair, interval, path_end, at_rest)
         graph = KeyframeGraph(start, self._doubts, self._parameters, keep=self._keep)
+        graph.use_sensor_rate(self._sensor_rate.factor, self._sensor_rate.between)
         self._first_R = start.R if self._first_R is None else self._first_R
         offset = pair.current_imu_ns - pair.stamp_ns
         first = pair.reference_imu_ns - offset, pair.reference_imu_ns

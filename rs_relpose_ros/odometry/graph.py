@@ -245,6 +245,15 @@ class KeyframeGraph:
         factors.addPriorVector(L(0), start.doubts, of(DOUBTS))
         self._update(factors, values, 0, 0.0)
 
+    def use_sensor_rate(self, factor: float, between: float) -> None:
+        """Count the noise of a gyro of whose samples each makes `factor` messages.
+
+        The messages of one sample have one error, so that a turn has the noise of fewer samples.
+        `between` [rad^2/s]: density of the errors of interpolation.
+        """
+        density = factor * self._imu.gyro_noise_density**2 + between
+        self._preintegration.setGyroscopeCovariance(density * np.eye(3))
+
     def propagated(self, interval: ImuInterval) -> KeyframeState:
         """The body after samples since the newest keyframe, without a new keyframe."""
         by, noise = self._linearised(self._predicted(interval))

@@ -1,30 +1,27 @@
 """The check of a bag: choose topics, read it once, report findings."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
-import textwrap
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.reader import Bag, Chosen, SensorTopics, Topic
-from rs_relpose_ros.calibration import findings_text, observations
+from rs_relpose_ros.calibration import observations
 from rs_relpose_ros.calibration.assessment import not_evaluated
 from rs_relpose_ros.calibration.findings import (
     Assessment,
     BY_CODE,
     Code,
-    Evidence,
     Finding,
     FindingState,
     QUANTITIES,
     Why,
 )
-from rs_relpose_ros.calibration.findings_text import Text, text_of, with_sigma
+from rs_relpose_ros.calibration.findings_text import text_of, with_sigma
 from rs_relpose_ros.calibration.observations import axes_text, frame_times, Varying
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
@@ -34,117 +31,25 @@ from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
 from rs_relpose_ros.messages.streams import (
     check_timelines,
     counter_unit,
+    find_multiplied,
     Kind,
     StreamFault,
-    true_rate,
 )
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
-
-OK = FindingState.OK
-UNKNOWN = FindingState.UNKNOWN
-SUSPECT = FindingState.SUSPECT
-WRONG = FindingState.WRONG
-
-
-class Line(NamedTuple):
-    """A finding in the report, with its text."""
-
-    finding: Finding
-    message: str
-    fix: str = ''
-
-    @property
-    def code(self) -> Code:
-        """What the line is about."""
-        return self.finding.code
-
-    @property
-    def state(self) -> FindingState:
-        """State of the finding."""
-        return self.finding.state
-
-    def as_json(self) -> dict[str, Any]:
-        """The line in `check --json`."""
-        finding = self.finding
-        text = Text(self.message, self.fix)
-        return {
-            'name': finding.code.value,
-            'verdict': finding.state.verdict,
-            'text': self.message,
-            'remedy': self.fix,
-            'figures': dict(finding.evidence.measured)
-            if finding.code.is_property
-            else findings_text.earlier_keys(finding, text),
-        } | findings_text.new_keys(finding)
-
-
-def property_line(
-    code: Code, state: FindingState, message: str, fix: str, measured: Mapping[str, Any]
-) -> Line:
-    """Line on a property of the recording."""
-    why = {OK: Why.CONSISTENT, UNKNOWN: Why.NOT_MEASURED}.get(state, Why.OFF)
-    return Line(Finding(code, state, why, evidence=Evidence(measured=measured)), message, fix)
-
-
-class Case(NamedTuple):
-    """State and fix if a condition holds; `more` follows the message of the line."""
-
-    holds: bool
-    state: FindingState
-    fix: str = ''
-    more: str = ''
-
-
-def by_case(code: Code, message: str, measured: Mapping[str, Any], *cases: Case) -> Line:
-    """Line by the first of the `cases` that holds; OK if none does."""
-    for case in cases:
-        if case.holds:
-            return property_line(code, case.state, message + case.more, case.fix, measured)
-    return property_line(code, OK, message, '', measured)
-
-
-@dataclass(frozen=True, slots=True)
-class CheckReport:
-    """All findings of one bag."""
-
-    bag: str
-    findings: tuple[Line, ...]
-
-    @property
-    def failed(self) -> bool:
-        """Whether something would make the estimation fail."""
-        return any(finding.state is WRONG for finding in self.findings)
-
-    def lines(self, width: int = 100) -> list[str]:
-        """The report as text of at most `width` columns."""
-        names = max(len(finding.code.value) for finding in self.findings)
-        lines = []
-        for finding in self.findings:
-            head = f'{finding.state.verdict:<8} {finding.code.value:<{names}}  '
-            text = finding.message + (f' -> {finding.fix}' if finding.fix else '')
-            lines += textwrap.wrap(
-                text,
-                width,
-                initial_indent=head,
-                subsequent_indent=' ' * len(head),
-                break_on_hyphens=False,
-            )
-        counts = Counter(finding.state for finding in self.findings)
-        return [
-            *lines,
-            f'{self.bag}: '
-            + ', '.join(f'{counts[state]} {state.verdict}' for state in FindingState),
-        ]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """The report as data for JSON."""
-        return {
-            'bag': self.bag,
-            'failed': self.failed,
-            'findings': [finding.as_json() for finding in self.findings],
-        }
+from rs_relpose_ros.offline.check_report import (
+    by_case,
+    Case,
+    CheckReport,
+    Line,
+    OK,
+    property_line,
+    SUSPECT,
+    UNKNOWN,
+    with_parents,
+    WRONG,
+)
 
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
@@ -194,7 +99,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
                     found=check_recording.calibrated(bag, topics, completion.parameters)
                 )
         findings += joint_findings(scan, sample, completion, parameters, faults)
-    return CheckReport(str(bag.path), tuple(findings))
+    return CheckReport(str(bag.path), with_parents(findings))
 
 
 def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Line:
@@ -464,6 +369,12 @@ def _calibration(scan: Scan) -> Line:
             f': for images of {size[0]}x{size[1]}, but they are {other[0]}x{other[1]}',
         ),
         Case(
+            bool(scan.contradictions),
+            SUSPECT,
+            '',
+            '; ' + '; '.join(sorted(scan.contradictions)),
+        ),
+        Case(
             straight and wide,
             SUSPECT,
             'correct for a simulated or a rectifying camera only: otherwise calibrate it',
@@ -555,7 +466,9 @@ def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
     gaps = int((stamps.forwards > gap).sum())
     hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
     recorded = f', recorded as {reliability}' if reliability else ''
-    true, how = true_rate(hertz, scan.rates) or (hertz, '')
+    multiplied = find_multiplied(scan.rates)
+    how = '' if multiplied is None else multiplied.how
+    true = hertz if multiplied is None else hertz / multiplied.factor
     return by_case(
         Code.IMU_RATE,
         f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
@@ -925,7 +838,7 @@ def _state(finding: Finding) -> FindingState:
 def _not_configured(code: Code, completion: Completion, scan: Scan) -> Line:
     """A parameter that is not configured, by the calibration."""
     found = completion.found
-    unknown = BY_CODE[code].unknown(Why.NOT_MEASURED)
+    unknown = BY_CODE[code].unknown(Why.NOT_MEASURED, Code.PARAMETERS)
     if found is None:
         message = f'not configured, and not estimated: {completion.problem}'
         return Line(unknown, message, _MEASURE)

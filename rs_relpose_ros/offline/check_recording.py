@@ -36,6 +36,7 @@ from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuBuffer
 from rs_relpose_ros.imu.filters import GyroBias
+from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
 from rs_relpose_ros.pipeline.pair import Frame
@@ -94,12 +95,16 @@ class Scan:
         self.largest_image = 0  # message of an image [bytes]
         self.intrinsics: Intrinsics | None = None
         self.calibrations = 0  # number of changes of them
+        self.contradictions: set[str] = set()  # of fields of the CameraInfo
         self.unusable: Counter[Role] = Counter()  # messages
         self.problems: dict[Role, str] = {}  # the first reason
 
     def add(self, role: Role, message: BagMessage) -> None:
         """Add the next message."""
         try:
+            if role is Role.CAMERA_INFO:
+                self._add_info(message.message)
+                return
             data = PARTS[role].read(message.message)
             if role in self._stamps:
                 stamps_ns, recorded_ns = self._stamps[role]
@@ -107,18 +112,21 @@ class Scan:
                 recorded_ns.append(message.bag_time_ns)
             if role is Role.IMAGE:
                 self._add_image(data)
-            elif role is not Role.CAMERA_INFO:
+            else:
                 self.orientations += data.orientation is not None
                 self._forces.extend(data.linear_acceleration or ())
                 self._rates.extend(data.angular_velocity or ())
                 self._buffer.add(data)
-            elif not self.configured.given:
-                self.calibrations += data != self.intrinsics
-                self.intrinsics = data
         except RsRelposeError as error:
             role = Role.IMU if role is Role.ACCEL else role
             self.unusable[role] += 1
             self.problems.setdefault(role, str(error))
+
+    def _add_info(self, message: Any) -> None:
+        found = intrinsics_from_info(message, self.contradictions.add)
+        if not self.configured.given:
+            self.calibrations += found != self.intrinsics
+            self.intrinsics = found
 
     def added(
         self,

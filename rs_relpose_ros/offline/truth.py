@@ -17,6 +17,9 @@ _MAX_GAP_NS = to_nanoseconds(0.2)
 # Fewest poses of a ground truth: fewer are no trajectory to compare with. [chosen: any value in
 # 2..10 would do]
 _MIN_POSES = 4
+# Farthest position [m]: powers of larger ones overflow in the spline. [chosen: beyond the moon;
+# any value from 1e8 to 1e50 would do]
+_FARTHEST = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +52,13 @@ class TrueTrajectory:
             )
         norms = np.linalg.norm(quats.clip(-2.0, 2.0), axis=1)  # squares of damaged ones overflow
         if not (
-            np.isfinite(positions).all()
+            bool(np.all(np.abs(positions) <= _FARTHEST))  # false for NaN
             and np.isfinite(quats).all()
             and (np.abs(norms - 1.0) < 1e-2).all()
         ):
             raise InputError(
-                'the ground truth has a pose that is not finite, or whose quaternion '
-                'has not the length 1'
+                'the ground truth has a pose that is not finite or beyond the moon, or whose '
+                'quaternion has not the length 1'
             )
         self._stamps = stamps[order]
         # Seconds since the first pose: absolute stamps do not fit into a float.
