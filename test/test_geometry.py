@@ -486,7 +486,7 @@ NAN, STEADY = float('nan'), np.zeros((2, 3))
                 ({'readout_time': -0.01}, 'readout_time'),
                 ({'readout_time': NAN}, 'readout_time'),
                 ({'reference_row': 'top'}, 'reference_row'),
-                ({'readout_direction': 'left'}, 'readout_direction'),
+                ({'readout_direction': 'sideways'}, 'readout_direction'),
                 ({'model': 'brown'}, 'distortion_model'),
                 ({'distortion': (0.1, 0.2, 0.3)}, 'distortion'),
                 ({'distortion': (0.1, float('inf'), 0.0, 0.0)}, 'distortion'),

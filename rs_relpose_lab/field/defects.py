@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.field.recording import FieldRecording, Gray, Samples
 from rs_relpose_lab.simulation.scene import make_texture
+from rs_relpose_lab.simulation.turned import turned_axes, turned_camera
 from rs_relpose_ros.geometry import Array
 
 NS = 1e9
@@ -295,40 +296,25 @@ def squeezed(recording: FieldRecording, factor: float) -> FieldRecording:
     )
 
 
-def portrait(recording: FieldRecording, turns: int) -> FieldRecording:
-    """The driver rotates images by `turns` quarter turns (1 left, 3 right, 2 upside down)."""
-    camera = recording.camera
-    for _ in range(turns):
-        # np.rot90: the pixel (u, v) moves to (v, width - 1 - u).
-        camera = replace(
-            camera,
-            width=camera.height,
-            height=camera.width,
-            cx=camera.cy,
-            cy=camera.width - 1.0 - camera.cx,
-            fx=camera.fy,
-            fy=camera.fx,
-            distortion=_turned_lens(camera.distortion),
-        )
-    # The image's x axis is the simulated camera's y axis after a quarter turn, and so on.
-    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    R = np.linalg.matrix_power(quarter, turns)
+def portrait(recording: FieldRecording, turns: int, *, configured: bool = False) -> FieldRecording:
+    """The driver rotates images by `turns` quarter turns (1 left, 3 right, 2 upside down).
+
+    The user's file states the new direction of the readout if it is `configured`, and after half a
+    turn, which keeps rows in rows.
+    """
+    camera = turned_camera(recording.camera, turns)
+    R = turned_axes(turns)
     R_camera_imu = Rotation.from_quat(recording.parameters['quat_cam_imu_xyzw'])
     quat = (Rotation.from_matrix(R.T) * R_camera_imu).as_quat().tolist()
-    truth = {**recording.truth, 'quat_cam_imu_xyzw': quat}
+    parameters = {**recording.parameters, 'quat_cam_imu_xyzw': tuple(quat)}
+    if 'imu_position' in parameters:
+        parameters['imu_position'] = tuple((R.T @ parameters['imu_position']).tolist())
+    if configured or turns == 2:
+        parameters['readout_direction'] = camera.readout_direction
+        parameters['stamp_row'] = camera.reference_row
     turned = recording.map_images(lambda _, pixels: np.rot90(pixels, turns))
-    # Only half a turn keeps rows in rows; after a quarter turn the user's file states nothing new.
-    reversed_rows = {'readout_direction': 'up', 'stamp_row': 'last'} if turns == 2 else {}
-    parameters = {**recording.parameters, 'quat_cam_imu_xyzw': tuple(quat), **reversed_rows}
+    truth = {**recording.truth, 'quat_cam_imu_xyzw': quat}
     return replace(turned, camera=camera, R_camera_image=R, truth=truth, parameters=parameters)
-
-
-def _turned_lens(distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """plumb_bob coefficients after `np.rot90`: x' = y, y' = -x exchanges the tangential ones."""
-    if len(distortion) < 4:
-        return distortion
-    k1, k2, p1, p2, *rest = distortion
-    return (k1, k2, -p2, p1, *rest)
 
 
 def mirrored(recording: FieldRecording) -> FieldRecording:

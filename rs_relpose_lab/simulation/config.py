@@ -37,10 +37,13 @@ class SimulationConfig(Settings):
         length=5,
     )
     readout_time: float = setting(
-        0.03, 'image height times line delay; 0 for a global shutter', 's', low=0.0, high=0.2
+        0.03, 'number of rows times line delay; 0 for a global shutter', 's', low=0.0, high=0.2
     )
     readout_direction: str = setting(
-        'down', 'whether row 0 is read first (down) or last (up)', choices=READOUT_DIRECTIONS
+        'down',
+        'whether row 0 is read first (down) or last (up); right or left for a portrait camera, '
+        'whose columns are read from that at the left or at the right',
+        choices=READOUT_DIRECTIONS,
     )
     exposure_time: float = setting(
         0.0, 'exposure of a row, over which it is averaged (motion blur)', 's', low=0.0, high=0.2

@@ -38,8 +38,10 @@ _inline = numba.njit(
 class Renderer:
     """Renders a scene for a camera on a trajectory.
 
-    Pixel centres are at integer coordinates; the exposure of row v has its middle at the time of
-    the reference row plus ``camera.row_times(v)``.
+    Pixel centres are at integer coordinates; the exposure of row v of the sensor has its middle at
+    the time of the reference row plus ``camera.row_times(v)``. Rays and images are in the order of
+    the sensor's rows, which are the columns of the image if the camera is read to the right or
+    left; `render` returns the image as it is published.
     """
 
     scene: Scene
@@ -59,6 +61,8 @@ class Renderer:
                 'weaker coefficients or a longer focal length'
             )
         rays = rays.reshape(self.camera.height, self.camera.width, 3)
+        if self.camera.readout_axis == 0:
+            rays = np.ascontiguousarray(rays.swapaxes(0, 1))
         object.__setattr__(self, '_rays', rays)
         object.__setattr__(self, '_tile_angles', _tile_angles(rays))
 
@@ -73,7 +77,7 @@ class Renderer:
         for later in within[1:]:
             image += self._at_once(reference_time + later)
         image /= count
-        return image
+        return image if self.camera.readout_axis == 1 else np.ascontiguousarray(image.T)
 
     def _exposure_samples(self, reference_time: float) -> int:
         """Number of times at which the exposure of a row is sampled."""
@@ -93,13 +97,13 @@ class Renderer:
         return max(1, math.ceil(motion / _EXPOSURE_STEP))
 
     def _at_once(self, reference_time: float) -> NDArray[np.float32]:
-        """Image of rows that are exposed for no time."""
-        rows = np.arange(self.camera.height)
+        """Image of rows that are exposed for no time, row by row of the sensor."""
+        rows = np.arange(self.camera.row_count)
         positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
         exposure = _Exposure(
             self._rays, self._tile_angles, positions, rotations, 1.0 / self.camera.fx
         )
-        shape = (self.camera.height, self.camera.width)
+        shape = self._rays.shape[:2]
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
         _render(exposure, self.scene, image, hits)
@@ -113,7 +117,7 @@ class Renderer:
         `points` (N, 2) may lie between pixels. Without a hit: NaN and -1.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-        times = reference_time + self.camera.row_times(points[:, 1])
+        times = reference_time + self.camera.pixel_times(points)
         positions, rotations = self.trajectory.poses(times)
         rays = np.einsum('nij,nj->ni', rotations, self.camera.unproject(points))
         distances = np.empty(len(points))
@@ -145,6 +149,7 @@ def view_of(camera: RollingShutterCamera) -> View:
         camera.height,
         line_delay,
         camera.reference_row_index,
+        camera.readout_axis,
     )
 
 

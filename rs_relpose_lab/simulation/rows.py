@@ -30,8 +30,14 @@ class View:
     unproject: Callable[[Array], Array]  # pixels (N, 2) to directions (N, 3) of any length
     width: int
     height: int
-    line_delay: float  # from one row to the row below [s]
+    line_delay: float  # from one row of the sensor to the next [s]
     reference_row: float  # that is read at time 0
+    axis: int = 1  # pixel coordinate that is the row of the sensor, 1 (v) or 0 (u)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the sensor."""
+        return self.height if self.axis == 1 else self.width
 
 
 def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: Array) -> Motion:
@@ -66,8 +72,8 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
 
     observed = np.full((len(world), 2), np.nan)
     left = np.arange(len(world))
-    before = np.full(len(world), 0.5 * (view.height - 1))
-    projected = project(left, before)[:, 1]
+    before = np.full(len(world), 0.5 * (view.rows - 1))
+    projected = project(left, before)[:, view.axis]
     ahead = np.isfinite(projected)
     left, before, projected = left[ahead], before[ahead], projected[ahead]
     rows, slope = projected, np.zeros(len(left))
@@ -75,20 +81,21 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
         if not len(left):
             break
         # A row far outside only means "not in the image"; the motion need not cover its time.
-        rows = np.clip(rows, -view.height, 2 * view.height)
+        rows = np.clip(rows, -view.rows, 2 * view.rows)
         pixels = project(left, rows)
+        appears = pixels[:, view.axis]
         change = rows - before
         moved = np.abs(change) > _SETTLED_ROWS
-        slope = np.where(moved, (pixels[:, 1] - projected) / np.where(moved, change, 1.0), slope)
+        slope = np.where(moved, (appears - projected) / np.where(moved, change, 1.0), slope)
         slow = np.abs(slope) < 1.0
-        settled = np.abs(pixels[:, 1] - rows) < _SETTLED_ROWS
+        settled = np.abs(appears - rows) < _SETTLED_ROWS
         observed[left[settled & slow]] = pixels[settled & slow]
         # From the last of those rows it is still further outside: it appears in no row.
-        beyond = (rows <= -view.height) & (pixels[:, 1] < rows) | (rows >= 2 * view.height) & (
-            pixels[:, 1] > rows
+        beyond = (rows <= -view.rows) & (appears < rows) | (rows >= 2 * view.rows) & (
+            appears > rows
         )
-        again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
-        left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
+        again = ~settled & ~beyond & np.isfinite(appears)
+        left, before, projected, slope = left[again], rows[again], appears[again], slope[again]
         rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
     inside = (
         (observed >= -margin) & (observed <= np.array([view.width - 1, view.height - 1]) + margin)

@@ -348,6 +348,7 @@ def evaluated(
     lens = _lens(data, parameters, sigmas, wide, one_axis) if final.free[model.FOCAL] else None
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
+        readout_axis=data.camera.readout_axis,
         fitted_readout=float(unknowns.parameters[model.READOUT]),
         time_offset=_offset_of_row_0(data, parameters, covariance, wide),
         R_cam_imu=R_cam_imu,
@@ -395,10 +396,10 @@ def _offset_of_row_0(
     data: Observations, parameters: Array, covariance: Array, wide: float
 ) -> Estimate:
     """Time offset of row 0, which is read half of the readout before the middle row."""
-    height = data.camera.height
+    camera = data.camera
     by_parameters = np.zeros(model.GLOBAL)
     by_parameters[model.OFFSET] = 1.0
-    by_parameters[model.READOUT] = -0.5 * (height - 1) / height
+    by_parameters[model.READOUT] = -camera.middle_row / camera.row_count
     value = float(by_parameters @ parameters)
     sigma = math.sqrt(by_parameters @ covariance @ by_parameters)
     return _estimate(value, sigma, wide * _MOST[model.OFFSET])

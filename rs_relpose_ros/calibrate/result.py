@@ -14,7 +14,7 @@ from rs_relpose_ros.calibration.findings_text import with_sigma
 from rs_relpose_ros.calibration.observations import AXES, axes_text
 from rs_relpose_ros.config.files import parameter_text, SourcedValue
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import readout_direction, RollingShutterCamera
 from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
 
 
@@ -45,11 +45,12 @@ class LensEstimates(NamedTuple):
 class CalibrationResult:
     """Calibration of a rolling-shutter camera against a gyro.
 
-    ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative readout time is
-    read upwards, with `time_offset` still that of row 0.
+    ``t_imu(row v) = stamp + time_offset + v / row_count * readout_time``: a negative readout time
+    is read upwards (or leftwards), with `time_offset` still that of row 0.
     """
 
     readout_time: Estimate  # signed [s]
+    readout_axis: int  # pixel coordinate that is the row: 1 (v), or 0 (u) for turned images
     fitted_readout: float  # without its bound, the frame interval [s]
     time_offset: Estimate  # of row 0 [s], at the median interval between frames
     R_cam_imu: Array  # (3, 3) v_cam = R_cam_imu v_imu
@@ -78,6 +79,11 @@ class CalibrationResult:
     matches: int
     frame_interval: float  # median [s]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def readout_direction(self) -> str:
+        """The parameter of this name, by the sign of the readout time."""
+        return readout_direction(self.readout_axis, self.readout_time.value)
 
     @property
     def needed(self) -> list[Estimate]:
@@ -125,6 +131,13 @@ class CalibrationResult:
 _BIAS_CHANGE = 1e-3
 # Milliseconds in a second. [derived: definition]
 _MS = 1e3
+# What the report adds to a readout time, by the direction; the usual one needs no words.
+_DIRECTIONS = {
+    'down': '',
+    'up': ', read upwards',
+    'right': ', by columns from left to right',
+    'left': ', by columns from right to left',
+}
 
 
 # A quantity of the report: its name, its value with 1 sigma in words, and its estimate.
@@ -145,7 +158,7 @@ def _clock_quantities(result: CalibrationResult) -> list[_Quantity]:
     """Readout time and time offset, and what the offset varies with."""
     readout = result.readout_time
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    direction = ', read upwards' if readout.value < 0.0 else ''
+    direction = _DIRECTIONS[result.readout_direction]
     text = _shown('readout_time', readout, abs(readout.value)) + direction
     offset = result.time_offset
     rows = [
@@ -341,8 +354,7 @@ def _readout_parameters(result: CalibrationResult) -> _Group:
         f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
         f'sigma); at most the {_MS * result.frame_interval:.1f} ms between frames.'
     )
-    upwards = rolling and readout.value < 0.0
-    direction = 'up' if upwards else 'down'
+    direction = readout_direction(result.readout_axis, readout.value if rolling else 0.0)
     values: list[_Parameter] = [
         ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
         _sigma('readout_time', readout.sigma, 6),

@@ -30,7 +30,11 @@ from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import (
+    readout_direction,
+    REFERENCE_ROWS,
+    RollingShutterCamera,
+)
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 
@@ -112,7 +116,7 @@ class Configured:
     @property
     def direction(self) -> float:
         """1 if row 0 is configured to be read first, -1 if it is the last."""
-        return 1.0 if self.sensor.readout_direction == 'down' else -1.0
+        return 1.0 if self.camera.reads_forward else -1.0
 
 
 def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
@@ -399,7 +403,7 @@ def _fault_findings(
     found = replace(consistent, state=state, why=Why.OFF, evidence=evidence, candidates=candidates)
     assert found.estimate is not None
     if quantity.code is Code.READOUT_TIME and found.estimate < 0.0:
-        other = 'up' if configured.sensor.readout_direction == 'down' else 'down'
+        other = readout_direction(configured.camera.readout_axis, -configured.direction)
         yield replace(found, code=Code.READOUT_DIRECTION, settings={'readout_direction': other})
         return
     settings = _setting(found, left, configured) | _tracking(quantity, found.estimate, configured)

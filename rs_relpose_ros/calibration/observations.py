@@ -360,7 +360,6 @@ class Observations:
         center = np.zeros(model.GLOBAL)
         center[model.LENS] = -self.lens
         pixels = self.tracks.points[np.hstack([pair.rows for pair in pairs])]
-        height = self.camera.height
         of_pixels = self.camera.points_by_lens(pixels.reshape(-1, 2))
         return model.Problem(
             self.gyro_times,
@@ -370,7 +369,7 @@ class Observations:
             self.stamps.covariates[frames],
             np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]),
             middles,
-            (pixels[:, :, 1] - 0.5 * (height - 1)) / height,
+            self.camera.readout_shares(pixels),
             of_pixels.values.reshape(pixels.shape),
             of_pixels.by_pixel.reshape(*pixels.shape, 2),
             of_pixels.by_lens.reshape(*pixels.shape, N_LENS),

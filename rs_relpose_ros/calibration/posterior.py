@@ -212,15 +212,15 @@ def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -
     rate = motion.angular_velocity
     of_image = problem.observations[problem.valid]
     times = of_image[:, 18 + image]
-    shares = (points[:, 1] - 0.5 * (camera.height - 1)) / camera.height
+    shares = camera.readout_shares(points)
     path = GyroPath.constant(rate, -1.0, 1.0) if motion.path is None else motion.path
     states = row_states(path, pair.R_cam_imu, times, shares)
     views = of_image[:, 9 * image : 9 * image + 9].reshape(-1, 3, 3)
     by_lens = camera.rays_by_lens(points)
     rays_by_lens = by_lens.by_lens[:, None], by_lens.by_pixel_by_lens.swapaxes(1, 2)
     moved = states.rotation[:, None] @ np.concatenate(rays_by_lens, axis=1)
-    # One row further down, the camera has rotated for one more line delay.
-    moved[:, 2] += camera.line_delay * (so3.skew(rate) @ moved[:, 0])
+    # One row further, the camera has rotated for one more line delay.
+    moved[:, 1 + camera.readout_axis] += camera.line_delay * (so3.skew(rate) @ moved[:, 0])
     if at.any():
         turned = Rotation.from_rotvec(states.by_deviation @ at).as_matrix()
         views = views @ turned.swapaxes(1, 2)
@@ -441,7 +441,7 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
 
 def middle_share(camera: RollingShutterCamera) -> float:
     """Rows from the stamped to the middle one, as a share of the readout: 0.5, 0 or -0.5."""
-    return (0.5 * (camera.height - 1) - camera.reference_row_index) / camera.height
+    return (camera.middle_row - camera.reference_row_index) / camera.row_count
 
 
 # -- Other times of the rows -------------------------------------------------------------------
@@ -454,9 +454,8 @@ def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairDa
 
     `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.
     """
-    signed = pair.camera.line_delay * pair.camera.height + float(deviations[_READOUT])
-    camera = replace(
-        pair.camera, readout_time=abs(signed), readout_direction='down' if signed >= 0.0 else 'up'
+    camera = pair.camera.with_signed_readout_time(
+        pair.camera.signed_readout_time + float(deviations[_READOUT])
     )
     known, (begin, end) = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9, camera.row_time_span
     begin, end = begin - _LEAST_SPAN, end + _LEAST_SPAN

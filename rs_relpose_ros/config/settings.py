@@ -632,7 +632,7 @@ class SensorConfig(Settings):
 
     readout_time: float | None = setting(
         None,
-        'image height times line delay; 0 for a global shutter',
+        'number of rows times line delay; 0 for a global shutter',
         's',
         low=0.0,
         high=0.5,
@@ -642,7 +642,9 @@ class SensorConfig(Settings):
     readout_time_sigma: float = _sigma('uncertainty of readout_time', 's', 1.0)
     readout_direction: str = setting(
         'down',
-        'whether row 0 is read first (down) or last (up)',
+        'whether row 0 is read first (down) or last (up); for images turned by 90 deg, whose '
+        'columns are the rows of the sensor: whether the left column is read first (right) or '
+        'last (left)',
         choices=camera.READOUT_DIRECTIONS,
         restarts=True,
     )
@@ -789,7 +791,7 @@ def sensor_model(
     """
     if config.readout_time is None:
         raise MissingInputError(
-            'parameter readout_time is not set: give image height times line '
+            'parameter readout_time is not set: give number of rows times line '
             'delay in seconds (0 for a global shutter)'
         )
     camera = dataclasses.replace(

@@ -136,6 +136,7 @@ class FrameRays(NamedTuple):
     times: Array  # (N,) of their rows after the reference row of the frame [s]
     rotations: Array  # (N, 3, 3) E_v of their rows
     row_rotation: Array  # (3,) rotation of the camera from one row to the next [rad]
+    axis: int  # of the pixel coordinate that is the row: 1 (v) or 0 (u)
     rate: Array  # (3,) of the camera [rad/s]
 
 
@@ -162,8 +163,13 @@ def fill_view(tracks: TrackBlocks, v: int, frame: FrameRays, inertia: FrameInert
         o, E, tau = tracks.observations[v, b], frame.rotations[n], frame.times[n]
         ray = rotated(E, frame.rays[n])
         by_u = rotated(E, frame.by_pixel[n, :, 0])
-        # One row further down, the camera has rotated on.
-        by_v = add(rotated(E, frame.by_pixel[n, :, 1]), cross(frame.row_rotation, ray))
+        by_v = rotated(E, frame.by_pixel[n, :, 1])
+        # One row further, the camera has rotated on.
+        turned = cross(frame.row_rotation, ray)
+        if frame.axis == 1:
+            by_v = add(by_v, turned)
+        else:
+            by_u = add(by_u, turned)
         u_by_ray, v_by_ray = _pseudo_inverse(by_u, by_v)
         write_column(ray, o, RAY, i)
         write_column(u_by_ray, o, TO_PIXELS, i)

@@ -106,7 +106,7 @@ def with_global_shutter_pixels(pose: RelativePose, problem: PairProblem) -> Rela
     row_times = []
     for image in (0, -1):
         points = problem.matches.points[image]
-        tau = camera.row_times(points[:, 1])
+        tau = camera.pixel_times(points)
         rays.append(problem.motions[image].derotate(camera.unproject(points), tau))
         row_times.append(tau)
     found = landmarks(pose, np.stack(rays), np.stack(row_times), camera)

@@ -207,8 +207,9 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
         3,
         2,
     )
-    used = _usable(rays, points[..., 1], camera.height)
-    rows = np.where(used, points[..., 1], camera.reference_row_index)
+    rows = camera.rows_of(points)
+    used = _usable(rays, rows, camera.row_count)
+    rows = np.where(used, rows, camera.reference_row_index)
     tracks = empty_blocks(path.rotations, float(path.seconds[-1]), count)
     times = camera.row_times(rows)
     alphas, betas, accelerations = _moved_by_imu(path)
@@ -221,6 +222,7 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
             times[view],
             motion.rotations(times[view]),
             camera.line_delay * motion.angular_velocity,
+            camera.readout_axis,
             motion.angular_velocity,
         )
         inertia = FrameInertia(
@@ -243,13 +245,13 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
 def _usable(
     rays: Array,
     rows: Array,
-    height: int,
+    row_count: int,
 ) -> NDArray[np.bool_]:
     """Which observations (V, N) are used: in the image, of tracks that start in it.
 
     The gyro covers the rows of the image only.
     """
-    used = np.isfinite(rays).all(axis=2) & (rows >= 0.0) & (rows <= height - 1.0)
+    used = np.isfinite(rays).all(axis=2) & (rows >= 0.0) & (rows <= row_count - 1.0)
     return np.asarray(used & used[0])
 
 

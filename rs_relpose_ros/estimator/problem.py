@@ -40,7 +40,7 @@ class TwoViewProblem:
 
 def middle_row_delay(camera: RollingShutterCamera) -> float:
     """Row time [s] of the middle row, against the camera's reference row."""
-    return float(camera.row_times((camera.height - 1) / 2))
+    return float(camera.row_times(camera.middle_row))
 
 
 def build_problem(
@@ -76,10 +76,10 @@ def build_problem(
     for image, pixels in enumerate((points1, points2)):
         motion = rotating[image]
         rays, jacobian = camera.unproject_with_jacobian(pixels)
-        tau = camera.row_times(pixels[:, 1]) - delay
+        tau = camera.pixel_times(pixels) - delay
         turn_per_row = camera.line_delay * motion.angular_velocity
         view = observations[:, VIEW_2 * image : VIEW_2 * (image + 1)]
-        derotate(rays, jacobian, motion.rotations(tau), turn_per_row, view)
+        derotate(rays, jacobian, motion.rotations(tau), turn_per_row, camera.readout_axis, view)
         observations[:, TIMES + image] = tau
     valid = np.asarray(np.isfinite(observations).all(axis=1))
     observations[~valid] = 0.0
@@ -98,15 +98,23 @@ def build_problem(
 
 @kernel
 def derotate(
-    rays: Array, jacobian: Array, rotations: Array, turn_per_row: Array, view: Array
+    rays: Array, jacobian: Array, rotations: Array, turn_per_row: Array, axis: int, view: Array
 ) -> None:
-    """Fill the `view` (N, 9) of one camera: derotated ray and its derivatives by u and v."""
+    """Fill the `view` (N, 9) of one camera: derotated ray and its derivatives by u and v.
+
+    `axis`: the pixel coordinate that is the row.
+    """
     for i in range(len(rays)):
         R = rotations[i]
         ray = rotated(R, rays[i])
         by_u = rotated(R, jacobian[i, :, 0])
-        # One row further down, the camera has rotated for one more line delay.
-        by_v = add(rotated(R, jacobian[i, :, 1]), cross(turn_per_row, ray))
+        by_v = rotated(R, jacobian[i, :, 1])
+        # One row further, the camera has rotated for one more line delay.
+        turn = cross(turn_per_row, ray)
+        if axis == 1:
+            by_v = add(by_v, turn)
+        else:
+            by_u = add(by_u, turn)
         for j in range(3):
             view[i, j] = ray[j]
             view[i, 3 + j] = by_u[j]

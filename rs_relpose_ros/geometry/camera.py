@@ -1,7 +1,8 @@
 """The rolling-shutter camera: pixel <-> unit ray, derivatives by the lens, and the time of a row.
 
 In the camera frame x points right, y down, z forward. The row time is the time of the **raw,
-distorted** row: the point is undistorted, its row is not.
+distorted** row: the point is undistorted, its row is not. A row is a row of the sensor: where the
+images are turned by 90 degrees, the rows of the sensor are the columns of the image.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,8 +28,12 @@ from rs_relpose_ros.geometry.lens import (
 
 # Names of the row from which row times count. [derived: definition of the parameter stamp_row]
 REFERENCE_ROWS = ('first', 'middle', 'last')
-# Names of the direction in which rows are read. [derived: definition of the parameter]
-READOUT_DIRECTIONS = ('down', 'up')
+# Names of the direction in which rows are read. The first two are for rows of the image, the last
+# two for columns of the image. [derived: definition of the parameter]
+READOUT_DIRECTIONS = ('down', 'up', 'right', 'left')
+# Directions in which row 0 is read first and last, by the pixel coordinate (u, v) that is the row.
+# [derived: row 0 is the left column or the top row]
+_ALONG = (('right', 'left'), ('down', 'up'))
 
 # Largest width and height of an image [px]: squares of pixels cannot overflow. [chosen: any value
 # beyond the largest sensors, 1e5 px, would do]
@@ -36,6 +41,12 @@ _LARGEST_IMAGE = 1_000_000
 # Largest focal length and distance of the principal point [px]: squares of rays cannot overflow.
 # [chosen: any value in 1e7..1e100 would do]
 _FARTHEST_PIXEL = 1e9
+
+
+def readout_direction(axis: int, seconds: float) -> str:
+    """Direction of a readout along a pixel coordinate, 0 or 1, that lasts `seconds`, signed."""
+    forward, backward = _ALONG[axis]
+    return forward if seconds >= 0.0 else backward
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,11 +65,13 @@ class RollingShutterCamera:
     distortion : sequence of float
         Coefficients in OpenCV's order; empty for no distortion.
     readout_time : float
-        `height` times the line delay [s]; 0 is a global shutter. It has no default.
-    readout_direction : {'down', 'up'}
-        Whether row 0 is read first ('down') or last ('up').
+        `row_count` times the line delay [s]; 0 is a global shutter. It has no default.
+    readout_direction : {'down', 'up', 'right', 'left'}
+        Whether row 0 is read first ('down') or last ('up'). 'right' and 'left' are for images that
+        are turned by 90 degrees: the columns of the image are the rows of the sensor, and the left
+        column, which is row 0, is read first ('right') or last ('left').
     reference_row : {'first', 'middle', 'last'}
-        The row from which row times count (row 0, (height-1)/2 or height-1). Motion refers to it,
+        The row from which row times count (row 0, (n-1)/2 or n-1 of n rows). Motion refers to it,
         and a relative pose relates the reference rows of its two frames.
     """
 
@@ -86,8 +99,8 @@ class RollingShutterCamera:
             validate.number(name, getattr(self, name), least, _FARTHEST_PIXEL, 'px')
         if not 0.0 <= self.readout_time < 1.0:
             raise InputError(
-                'readout_time must be in [0, 1) s (height times line delay; 0 for a global '
-                f'shutter), got {self.readout_time!r}'
+                'readout_time must be in [0, 1) s (number of rows times line delay; 0 for a '
+                f'global shutter), got {self.readout_time!r}'
             )
         validate.choice('readout_direction', self.readout_direction, READOUT_DIRECTIONS)
         validate.choice('reference_row', self.reference_row, REFERENCE_ROWS)
@@ -102,27 +115,68 @@ class RollingShutterCamera:
         object.__setattr__(self, 'distortion', coefficients)
 
     @property
+    def readout_axis(self) -> int:
+        """Pixel coordinate that is the row of the sensor: 1 (v), or 0 (u) if images are turned."""
+        return 1 if self.readout_direction in _ALONG[1] else 0
+
+    @property
+    def reads_forward(self) -> bool:
+        """Whether row 0 is read first."""
+        return self.readout_direction in ('down', 'right')
+
+    @property
+    def row_count(self) -> int:
+        """Number of rows that are read one after the other: height, or width if turned."""
+        return self.height if self.readout_axis == 1 else self.width
+
+    @property
     def line_delay(self) -> float:
-        """Signed time from one row to the row below it [s]; negative when read upwards."""
-        delay = self.readout_time / self.height
-        return delay if self.readout_direction == 'down' else -delay
+        """Signed time from one row to the next one [s]; negative where row 0 is read last."""
+        delay = self.readout_time / self.row_count
+        return delay if self.reads_forward else -delay
+
+    @property
+    def signed_readout_time(self) -> float:
+        """Readout time [s]; negative where row 0 is read last."""
+        return self.line_delay * self.row_count
+
+    def with_signed_readout_time(self, seconds: float) -> 'RollingShutterCamera':
+        """The camera with another readout time, along the same axis of the image."""
+        direction = readout_direction(self.readout_axis, seconds)
+        return replace(self, readout_time=abs(seconds), readout_direction=direction)
+
+    @property
+    def middle_row(self) -> float:
+        """Middle of the rows: (n - 1) / 2 of n rows."""
+        return (self.row_count - 1) / 2
 
     @property
     def reference_row_index(self) -> float:
-        """Row from which row times count: 0, (height - 1) / 2 or height - 1."""
-        return {'first': 0.0, 'middle': (self.height - 1) / 2, 'last': self.height - 1.0}[
-            self.reference_row
-        ]
+        """Row from which row times count: 0, (n - 1) / 2 or n - 1 of n rows."""
+        last = self.row_count - 1.0
+        return {'first': 0.0, 'middle': self.middle_row, 'last': last}[self.reference_row]
+
+    def rows_of(self, pixels: Array) -> Array:
+        """Rows (...) of the sensor that have pixels (..., 2)."""
+        return np.asarray(pixels[..., self.readout_axis])
 
     def row_times(self, rows: ArrayLike) -> Array:
         """Row times ``tau = (row - reference row) * line_delay`` [s] of raw, distorted rows."""
         rows = np.asarray(rows, dtype=np.float64)
         return (rows - self.reference_row_index) * self.line_delay
 
+    def pixel_times(self, pixels: Array) -> Array:
+        """Row times (...) [s] of raw, distorted pixels (..., 2)."""
+        return self.row_times(self.rows_of(pixels))
+
+    def readout_shares(self, pixels: Array) -> Array:
+        """Rows (...) of pixels (..., 2) after the middle row, as shares of all rows."""
+        return (self.rows_of(pixels) - self.middle_row) / self.row_count
+
     @property
     def row_time_span(self) -> tuple[float, float]:
         """Smallest and largest row time of the image [s]."""
-        ends = self.row_times([0.0, self.height - 1.0])
+        ends = self.row_times([0.0, self.row_count - 1.0])
         return float(ends.min()), float(ends.max())
 
     @property
@@ -154,7 +208,8 @@ class RollingShutterCamera:
             rays,
             rows,
             rotations,
-            self.height,
+            self.readout_axis,
+            self.row_count,
             (self.fx, self.fy, self.cx, self.cy),
             self._compiled,
         )

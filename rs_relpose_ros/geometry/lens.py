@@ -222,6 +222,13 @@ DISTORTION_MODELS = {
 # Depth below which a point does not lie in front of the camera, in the unit of the points; the
 # quotients by the depth stay finite. [chosen: any value between rounding and a millimetre]
 _NEAREST = 1e-9
+# Distance of the assumed row from the projected one [px] at which the row of a ray is found. A
+# larger one bends the derotated image, a smaller one costs rounds.
+# [chosen: 0.001 to 0.05 would do]
+_SETTLED = 0.01
+# Rounds after which the row of a ray is given up: secants settle in a few, unless points cross the
+# rows as fast as they are read. [chosen: any value in 8..30 would do]
+_MOST_ROUNDS = 12
 
 
 @kernel
@@ -353,31 +360,30 @@ def project_rotating(
     rays: Array,
     rows: Array,
     rotations: Array,
-    height: int,
+    axis: int,
+    row_count: int,
     intrinsics: tuple[float, float, float, float],
     lens: CompiledLens,
 ) -> Array:
     """`RollingShutterCamera.project_rotating` with `intrinsics` fx, fy, cx, cy.
 
-    Row v images a ray if the orientation at the time of row v projects the ray into row v: a root
-    of ``projected_row(v) - v``, found by the secant method. Rotations are linear between their
-    rows, and beyond.
+    `axis`: the pixel coordinate that is the row. Row v images a ray that the orientation at its
+    time projects into row v: a root of ``projected_row(v) - v``, by the secant method. Rotations
+    are linear between their rows, and beyond.
     """
-    settled = 0.01  # largest distance of the assumed row from the projected one [px]
-    most_rounds = 12
     fx, fy, cx, cy = intrinsics
     out = np.empty((len(rays), 2))
     rotated = np.empty(3)
     profile = np.empty(_PROFILE)
     values = np.empty(6)
-    per_row = (len(rotations) - 1) / max(height - 1.0, 1.0)
+    per_row = (len(rotations) - 1) / max(row_count - 1.0, 1.0)
     for n in range(len(rays)):
         row = rows[n]
         before = rows[n]
         ahead = 0.0
         slope = 0.0
         u = v = math.nan
-        for step in range(most_rounds):
+        for step in range(_MOST_ROUNDS):
             place = row * per_row
             i = int(min(max(place, 0.0), len(rotations) - 2.0))
             share = place - i
@@ -393,18 +399,19 @@ def project_rotating(
             distort(x, y, lens, profile, values)
             u = cx + fx * values[0]
             v = cy + fy * values[1]
-            if abs(v - row) < settled:
+            projected = v if axis == 1 else u
+            if abs(projected - row) < _SETTLED:
                 break
-            if step == most_rounds - 1:
+            if step == _MOST_ROUNDS - 1:
                 u = v = math.nan
             # Derivative of the projected row by the assumed row.
             if step > 0 and row != before:
-                slope = (v - ahead) / (row - before)
+                slope = (projected - ahead) / (row - before)
             if not abs(slope) < 0.9:
                 slope = 0.0
             before = row
-            ahead = v
-            row += (v - row) / (1.0 - slope)
+            ahead = projected
+            row += (projected - row) / (1.0 - slope)
         out[n, 0] = u
         out[n, 1] = v
     return out

@@ -139,7 +139,7 @@ class Sensor(NamedTuple):
     def derotated(self, points: Array, motion: FrameMotion) -> tuple[Array, Array]:
         """Rays (N, 3) of pixels (N, 2) of a published image, and their row times (N,) [s]."""
         pixels = self.intrinsics.to_sensor(points)
-        row_times = self.camera.row_times(pixels[:, 1])
+        row_times = self.camera.pixel_times(pixels)
         return motion.derotate(self.camera.unproject(pixels), row_times), row_times
 
     def project(self, rays: Array, row_times: Array, motion: FrameMotion) -> Array:
@@ -153,9 +153,8 @@ class Sensor(NamedTuple):
         for _ in range(2):
             rotations = motion.rotations(np.clip(row_times, first, last))
             pixels = camera.project(np.einsum('nji,nj->ni', rotations, rays))
-            row_times = np.where(
-                np.isfinite(pixels[:, 1]), camera.row_times(pixels[:, 1]), row_times
-            )
+            improved = camera.pixel_times(pixels)
+            row_times = np.where(np.isfinite(improved), improved, row_times)
         return self.intrinsics.to_image(pixels)
 
 

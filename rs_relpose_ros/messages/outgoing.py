@@ -632,7 +632,8 @@ _SHIFT = 4
 def draw_pair(result: PairResult) -> Color:
     """The current image (H, W, 3) in blue, green, red, with the matches of its pair as lines.
 
-    Inliers have the colour of their row (bar on the left, with times), outliers are cyan.
+    Inliers have the colour of their row (bar with times, on the left or above), outliers are
+    cyan.
     """
     assert result.image2 is not None
     height, width = result.image2.shape
@@ -644,19 +645,24 @@ def draw_pair(result: PairResult) -> Color:
     inliers = result.pose.inliers
     if len(inliers) != len(result.matches):  # a pair without an estimate has none
         inliers = np.zeros(len(result.matches), dtype=bool)
-    _draw_matches(canvas, result.matches, inliers, height, scale)
-    _draw_row_times(canvas, result.matches, height)
+    # Rows are columns of the image where the camera is read to the right or left.
+    axis = result.readout_axis
+    shares = result.matches.points2[:, axis] / (width, height)[axis]
+    _draw_matches(canvas, result.matches, inliers, shares, scale)
+    _draw_row_times(canvas, result.matches, axis, (width, height)[axis])
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
     _write(caption, _caption(result, int(inliers.sum())), (6, 16))
     return np.concatenate([canvas, caption])
 
 
 def _draw_matches(
-    canvas: Color, matches: Matches, inliers: NDArray[np.bool_], height: int, scale: float
+    canvas: Color, matches: Matches, inliers: NDArray[np.bool_], shares: Array, scale: float
 ) -> None:
-    """Draw a line for each match; its dot is the point in the current image of `height` rows."""
-    rows = matches.points2[:, 1]
-    colors = _COLORS[(rows / height * len(_COLORS)).astype(int)].tolist()
+    """Draw a line for each match; its dot is the point in the current image.
+
+    `shares` (N,): rows of the points in the current image, as shares of all rows.
+    """
+    colors = _COLORS[(shares * len(_COLORS)).astype(int)].tolist()
     points = np.stack([matches.points1, matches.points2], axis=1)
     scaled = (points + 0.5) * scale - 0.5  # pixel centres lie at integer coordinates
     ends = np.round(scaled * (1 << _SHIFT)).astype(int).tolist()
@@ -666,17 +672,26 @@ def _draw_matches(
         cv2.circle(canvas, end, 2 << _SHIFT, drawn, -1, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_row_times(canvas: Color, matches: Matches, height: int) -> None:
-    """Draw the colours of the `height` rows, and the times of the first and of the last one."""
-    rows = matches.points2[:, 1]
+def _draw_row_times(canvas: Color, matches: Matches, axis: int, row_count: int) -> None:
+    """Draw the colours of the rows, and the times of the first and of the last one.
+
+    The bar is at the left, or at the top for rows that are columns of the image (`axis` 0).
+    """
+    rows = matches.points2[:, axis]
     if not len(rows) or np.ptp(rows) < 1.0:
         return
-    canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
+    height, width = canvas.shape[:2]
+    if axis == 1:
+        canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, height))
+        places = (_BAR_WIDTH + 4, 14), (_BAR_WIDTH + 4, height - 6)
+    else:
+        canvas[:_BAR_WIDTH] = cv2.resize(_COLORS[None], (width, _BAR_WIDTH))
+        places = (4, _BAR_WIDTH + 14), (max(width - 64, 4), _BAR_WIDTH + 14)
     line = np.polyfit(rows, matches.row_times[1], 1)
-    first, last = np.polyval(line, (0, height - 1))
-    for time, y in ((first, 14), (last, len(canvas) - 6)):
+    first, last = np.polyval(line, (0, row_count - 1))
+    for time, place in zip((first, last), places, strict=True):
         # Adding zero makes a negative zero positive.
-        _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y))
+        _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', place)
 
 
 def _caption(result: PairResult, inliers: int) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.config.settings import Parameters, sensor_model, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -99,6 +99,7 @@ def export_into(
     `trajectory`: folder of `rs_relpose odometry` with the same bag. InputError if no image has a
     pose, or none can be used.
     """
+    _check_readout(parameters.sensor, choice)
     rows = RowTrajectory.load(trajectory / ROWS_FILE)
     observations = KeyframeObservations.load(trajectory / TRACKS_FILE)
     run = _Frames(folder, rows, observations, parameters, choice)
@@ -125,6 +126,17 @@ def export_into(
     }
     (folder / REPORT_FILE).write_text(json.dumps(report, indent=1) + '\n', encoding='utf-8')
     return report
+
+
+def _check_readout(sensor: SensorConfig, choice: Choice) -> None:
+    """InputError if the format cannot describe raw images with this direction of the readout."""
+    by_columns = bool(sensor.readout_time) and sensor.readout_direction in ('right', 'left')
+    if by_columns and choice.image_kind != UNROLLED and not choice.format.has_columns:
+        raise InputError(
+            f'the format {choice.format_name} knows images that are read row by row only, and '
+            f'readout_direction is {sensor.readout_direction!r}: export with --images {UNROLLED}, '
+            'or choose another format'
+        )
 
 
 class _View(NamedTuple):
@@ -208,7 +220,7 @@ class _Frames:
         if frame.intrinsics != self.sensor.intrinsics:
             self.leave_out(frame.stamp_ns, 'it has other intrinsics')
             return
-        times = at_ns + _row_delays(sensor, frame.intrinsics.image_height)
+        times = at_ns + _row_delays(sensor)
         if self.rows.covers(times).all():
             self.views.append(_View(self._write(frame), frame.stamp_ns, at_ns, times))
         else:
@@ -310,11 +322,12 @@ class _Frames:
         )
 
 
-def _row_delays(sensor: Sensor, height: int) -> Ints:
+def _row_delays(sensor: Sensor) -> Ints:
     """Delays (3,) [ns] of the first, the middle and the last row that are read of an image."""
-    edges = np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (height - 1)
-    rows = sensor.intrinsics.to_sensor(edges)[:, 1]
-    delays = np.sort(sensor.camera.row_times(rows))
+    part = sensor.intrinsics
+    corner = np.array([part.image_width - 1, part.image_height - 1])
+    edges = np.array([[0.0], [0.5], [1.0]]) * corner
+    delays = np.sort(sensor.camera.pixel_times(part.to_sensor(edges)))
     return np.rint(NANOSECONDS * delays).astype(np.int64)
 
 
@@ -351,6 +364,9 @@ def _published(sensor: Sensor) -> RollingShutterCamera:
     """Camera of the published images: region of interest and binning applied."""
     camera, part = sensor.camera, sensor.intrinsics
     ((cx, cy),) = part.to_image([[camera.cx, camera.cy]]).tolist()
+    sizes = part.image_width, part.image_height
+    binnings = part.binning_x, part.binning_y
+    axis = camera.readout_axis
     return replace(
         camera,
         width=part.image_width,
@@ -359,7 +375,7 @@ def _published(sensor: Sensor) -> RollingShutterCamera:
         fy=camera.fy / part.binning_y,
         cx=cx,
         cy=cy,
-        readout_time=abs(camera.line_delay) * part.binning_y * part.image_height,
+        readout_time=abs(camera.line_delay) * binnings[axis] * sizes[axis],
         reference_row='first',
     )
 
@@ -371,7 +387,7 @@ def _shown(
     pixels: Array,
 ) -> Array:
     """Pixels (N, 2) of derotated images of pixels of the frames k (N,)."""
-    R, _ = rows.pose(model.times_of(k, pixels[:, 1]))
+    R, _ = rows.pose(model.times_of(k, model.camera.rows_of(pixels)))
     in_world = rotated(R, model.camera.unproject(pixels))
     return model.camera.project(rotated_back(model.R[k, formats.MIDDLE], in_world))
 
@@ -403,7 +419,7 @@ def _deviations(
     k, points = model.observed[:, 0], model.points[model.observed[:, 1]]
     if not len(k):
         return None, None
-    at_row = model.pixels[:, 1]
+    at_row = model.camera.rows_of(model.pixels)
     by_path = formats.projected(formats.path(rows), model, k, points, at_row)
     by_formula = formats.projected(chosen.place, exported, k, points, at_row)
     shown = by_path if exported.rolls else _shown(model, rows, k, by_path)

@@ -84,7 +84,7 @@ class Model:
     ) -> Ints:
         """Times (N,) [ns] of rows of the frames k (N,), limited to those of the image."""
         begin, _, end = self.times_ns[k].T
-        first_row = 0.0 if self.reads_down else self.camera.height - 1.0
+        first_row = 0.0 if self.camera.reads_forward else self.camera.row_count - 1.0
         delays = self.camera.line_delay * (np.nan_to_num(rows) - first_row)
         times = begin + np.rint(NANOSECONDS * delays).astype(np.int64)
         return np.clip(times, begin, end)
@@ -93,11 +93,6 @@ class Model:
     def rolls(self) -> bool:
         """Whether the images have a rolling shutter."""
         return self.camera.readout_time > 0.0
-
-    @property
-    def reads_down(self) -> bool:
-        """Whether the top row is read first."""
-        return self.camera.readout_direction == 'down'
 
 
 def rotated(R: Array, vectors: Array) -> Array:
@@ -112,7 +107,7 @@ def rotated_back(R: Array, vectors: Array) -> Array:
 
 # -- where a format has the camera at a row -------------------------------------------------------
 #
-# Points (N, 3) in the camera of the frames k (N,) at the rows (N,) of the image, to the camera's
+# Points (N, 3) in the camera of the frames k (N,) at the rows (N,) of the sensor, to the camera's
 # axes there.
 
 Placement = Callable[[Model, Ints, Array, Array], Array]
@@ -120,8 +115,8 @@ Placement = Callable[[Model, Ints, Array, Array], Array]
 
 def _share(model: Model, rows: Array) -> Array:
     """Share of the readout (N,), 0 at the row that is read first."""
-    share = rows / (model.camera.height - 1.0)
-    return share if model.reads_down else 1.0 - share
+    share = rows / (model.camera.row_count - 1.0)
+    return share if model.camera.reads_forward else 1.0 - share
 
 
 def _slerp_back(
@@ -221,7 +216,8 @@ def projected(
     """Pixels (N, 2) of points at the poses of their own rows; `rows` (N,): first guesses."""
     pixels = np.column_stack([rows, rows])
     for _ in range(_ROW_ROUNDS):
-        pixels = model.camera.project(place(model, k, points, pixels[:, 1]))
+        at = model.camera.rows_of(pixels)
+        pixels = model.camera.project(place(model, k, points, at))
     return pixels
 
 
@@ -386,7 +382,7 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
     are read upwards the velocities have the other sign. nerfstudio 50e0e3c ignores what it does
     not know.
     """
-    sign = 1.0 if model.reads_down else -1.0
+    sign = 1.0 if model.camera.reads_forward else -1.0
     flip = sign * np.diag(_OPENGL)[:3]
     _write_transforms(
         model,
@@ -425,20 +421,21 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
     slerp and lerp at ``t = A + B u + C v`` with v = (row + 0.5) / H. `scale` and `offset` put the
     cameras into the middle half of its unit cube.
     """
-    height = model.camera.height
+    camera = model.camera
     poses = model.poses @ _OPENGL
     places = model.positions[:, MIDDLE]
     low, high = places.min(axis=0), places.max(axis=0)
     size = float((high - low).max())
     scale = 0.5 / max(size, 1e-6)
-    shutter = np.array([-0.5, 0.0, height, 0.0]) / (height - 1.0)
-    if not model.reads_down:
+    by_row = [0.0, camera.row_count] if camera.readout_axis == 1 else [camera.row_count, 0.0]
+    shutter = np.array([-0.5, *by_row, 0.0]) / (camera.row_count - 1.0)
+    if not camera.reads_forward:
         shutter = np.array([1.0, 0.0, 0.0, 0.0]) - shutter
     _write_transforms(
         model,
         folder,
         {
-            'is_fisheye': lens_of(model.camera).fisheye,
+            'is_fisheye': lens_of(camera).fisheye,
             'rolling_shutter': (model.rolls * shutter).tolist(),
             'aabb_scale': 32,
             'scale': scale,
@@ -452,20 +449,23 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
     )
 
 
+# Values of gsplat's enum of shutters, by the direction of the readout.
+# [derived: gsplat 90d7b4b, cuda/_wrapper.py]
+_GSPLAT_SHUTTERS = {'down': 0, 'right': 1, 'up': 2, 'left': 3, 'global': 4}
+
+
 def _write_gsplat(model: Model, folder: Path) -> None:
     """cameras.npz: arguments of ``gsplat.rasterization``, and the points.
 
     gsplat 90d7b4b, cuda/_wrapper.py, cuda/include/Cameras.cuh, rendering.py: from world to camera
     at the row that is read first (`viewmats`) and last (`viewmats_rs`), slerp and lerp between at
-    ``floor(y) / (H - 1)``; `rolling_shutter`: 0 downwards, 2 upwards, 4 global.
+    ``floor(y) / (H - 1)``, or ``floor(x) / (W - 1)``; `rolling_shutter`: `_GSPLAT_SHUTTERS`.
     """
     camera, lens = model.camera, lens_of(model.camera)
     views = np.linalg.inv(model.poses)
     K = camera.camera_matrix
     K[:2, 2] += _HALF_PIXEL
-    shutter = 4
-    if model.rolls:
-        shutter = 0 if model.reads_down else 2
+    direction = camera.readout_direction if model.rolls else 'global'
     with (folder / 'cameras.npz').open('wb') as file:
         np.savez_compressed(
             file,
@@ -474,7 +474,7 @@ def _write_gsplat(model: Model, folder: Path) -> None:
             Ks=np.tile(K, (len(views), 1, 1)),
             width=camera.width,
             height=camera.height,
-            rolling_shutter=shutter,
+            rolling_shutter=_GSPLAT_SHUTTERS[direction],
             camera_model='fisheye' if lens.fisheye else 'pinhole',
             radial_coeffs=lens.k,
             tangential_coeffs=lens.p,
@@ -540,13 +540,22 @@ def _write_ncore(model: Model, folder: Path) -> None:
     writer.finalize()
 
 
+# Names in NCore's enum of shutters, by the direction of the readout.
+# [derived: ncore 77144a9, impl/data/types.py]
+_NCORE_SHUTTERS = {
+    'down': 'ROLLING_TOP_TO_BOTTOM',
+    'right': 'ROLLING_LEFT_TO_RIGHT',
+    'up': 'ROLLING_BOTTOM_TO_TOP',
+    'left': 'ROLLING_RIGHT_TO_LEFT',
+    'global': 'GLOBAL',
+}
+
+
 def _ncore_camera(model: Model, types: Any) -> Any:
     """Camera parameters of NCore; `types`: its module ``ncore.impl.data.types``."""
     camera, lens = model.camera, lens_of(model.camera)
-    shutter = types.ShutterType.GLOBAL
-    if model.rolls:
-        down = types.ShutterType.ROLLING_TOP_TO_BOTTOM
-        shutter = down if model.reads_down else types.ShutterType.ROLLING_BOTTOM_TO_TOP
+    direction = camera.readout_direction if model.rolls else 'global'
+    shutter = types.ShutterType[_NCORE_SHUTTERS[direction]]
     fx, fy, cx, cy = _focal_and_centre(camera)
     common = {
         'resolution': np.array([camera.width, camera.height], dtype=np.uint64),
@@ -569,13 +578,17 @@ def _ncore_camera(model: Model, types: Any) -> Any:
 
 
 class Format(NamedTuple):
-    """An exporter; `place`: its formula; `radial`: number of radial coefficients it knows."""
+    """An exporter; `place`: its formula; `radial`: number of radial coefficients it knows.
+
+    `has_columns`: whether it knows raw images whose columns are read one after the other.
+    """
 
     write: Callable[[Model, Path], None]
     place: Placement
     poses: str  # the formula in words
     images: str  # 'raw' or 'unrolled', by default
     radial: int = 6
+    has_columns: bool = True
 
 
 # How two formats take poses of rows.
@@ -584,7 +597,7 @@ _LINEAR = 'poses of the first and the last row, linear between'
 FORMATS: Mapping[str, Format] = {
     'colmap': Format(_write_colmap, middle, 'one pose per image', 'unrolled'),
     'nerfstudio': Format(
-        _write_nerfstudio, velocity_of_pixel, 'a pose and velocities per image', 'raw', 3
+        _write_nerfstudio, velocity_of_pixel, 'a pose and velocities per image', 'raw', 3, False
     ),
     'gsplat': Format(_write_gsplat, lerp_of_translation, _LINEAR, 'raw'),
     'instant-ngp': Format(_write_instant_ngp, lerp_of_position, _LINEAR, 'raw', 2),

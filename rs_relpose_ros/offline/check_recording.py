@@ -252,7 +252,7 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Complet
     if 'readout_time' in missing and readout.observable:
         values |= {
             'readout_time': abs(readout.value),
-            'readout_direction': 'up' if readout.value < 0.0 else 'down',
+            'readout_direction': found.readout_direction,
         }
     return Completion(parameters.updated(values), found, next(iter(problems), ''))
 
@@ -269,13 +269,13 @@ def contradicted(
     readout, camera = found.readout_time, model.camera
     angle = float(Rotation.from_matrix(found.R_cam_imu @ sensor.R_cam_imu.T).magnitude())
     # Of the stamped row; the calibration has that of row 0, at the median interval.
-    share = camera.reference_row_index / camera.height
+    share = camera.reference_row_index / camera.row_count
     off = (
         found.time_offset.value
         + share * readout.value
         - model.clock.reference_ns(0, to_nanoseconds(found.frame_interval)) / NANOSECONDS
     )
-    signed = camera.line_delay * camera.height
+    signed = camera.signed_readout_time
     axes_sigma = float(found.rotation_sigma.max())
     offset_sigma = math.hypot(found.time_offset.sigma, share * readout.sigma)
     by_readout = _contradiction(Code.READOUT_TIME, abs(signed), abs(readout.value), readout.sigma)
@@ -284,7 +284,7 @@ def contradicted(
             by_readout,
             code=Code.READOUT_DIRECTION,
             estimated=(-abs(readout.value),),
-            settings={'readout_direction': 'up' if readout.value < 0.0 else 'down'},
+            settings={'readout_direction': found.readout_direction},
         )
     return tuple(
         finding

@@ -88,16 +88,17 @@ class MiddleRow:
         self._nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
         pixels = intrinsics.to_sensor(self._nodes)
         self._rays = camera.unproject(pixels)
-        self._rows = np.ascontiguousarray(pixels[:, 1])  # of the sensor
-        _, middle = intrinsics.to_sensor([[0.0, 0.5 * (sizes[0] - 1)]])[0]
-        self.delay = float(camera.row_times(middle))
+        self._rows = np.ascontiguousarray(camera.rows_of(pixels))  # of the sensor
+        height, width = sizes
+        middle = intrinsics.to_sensor([0.5 * (width - 1), 0.5 * (height - 1)])
+        self.delay = float(camera.pixel_times(middle))
 
     def map(self, motion: FrameMotion) -> RowMap:
         """Where the pixels come from, for a motion relative to the reference row of the camera."""
         camera = self.sensor.camera
         intrinsics = self.sensor.intrinsics
         # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
-        rows = np.linspace(0.0, camera.height - 1.0, _ORIENTATIONS)
+        rows = np.linspace(0.0, camera.row_count - 1.0, _ORIENTATIONS)
         turns = np.einsum(
             'nji,jk->nik',
             motion.rotations(camera.row_times(rows)),

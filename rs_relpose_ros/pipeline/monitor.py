@@ -273,7 +273,7 @@ class Tracked:
         along[offset] = 1.0
         along[readout] = posterior.middle_share(configured.camera)
         of_middle = configured.sensor.time_offset + float(along @ estimated.c)
-        signed = configured.camera.line_delay * configured.camera.height  # active
+        signed = configured.camera.signed_readout_time  # active
         now = signed - configured.active[readout] + estimated.c[readout]
         return cls(
             configured.gyro_bias + estimated.c[bias],

@@ -139,6 +139,7 @@ class PairResult:
     applied: Applied = field(default_factory=Applied)
     gyro_bias: Array | None = None  # (3,) [rad/s] that was removed, IMU frame
     image2: NDArray[np.uint8] | None = None  # only if the front end keeps images
+    readout_axis: int = 1  # pixel coordinate that is the row: 1 (v), or 0 (u) for turned images
 
     @property
     def landmarks(self) -> Landmarks | None:
@@ -463,6 +464,7 @@ class TrackHistory:
             landmarks_of=points if pose else None,
             gyro_rotation=None if since is None else since.rotation,
             gyro_bias=None if since is None else parameters.sensor.R_cam_imu.T @ since.bias,
+            readout_axis=sensor.camera.readout_axis,
         )
 
 
