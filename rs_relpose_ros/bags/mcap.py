@@ -23,36 +23,38 @@ from rs_relpose_ros.bags.storage import (
     StoredTopic,
 )
 
-# All kinds and layouts of records are [derived: the MCAP specification].
-# A footer ends the file.
+# A footer ends the file. Kinds and layouts of records are those of the specification above.
+# [derived: MCAP]
 _FOOTER = 0x02
-# A schema names and defines a type.
+# A schema names and defines a type. [derived: MCAP]
 _SCHEMA = 0x03
-# A channel is a topic.
+# A channel is a topic. [derived: MCAP]
 _CHANNEL = 0x04
-# A message may lie in a chunk or outside of all chunks.
+# A message may lie in a chunk or outside of all chunks. [derived: MCAP]
 _MESSAGE = 0x05
-# A chunk holds compressed records.
+# A chunk holds compressed records. [derived: MCAP]
 _CHUNK = 0x06
-# Statistics count the messages of each channel.
+# Statistics count the messages of each channel. [derived: MCAP]
 _STATISTICS = 0x0B
-# This record ends the data.
+# This record ends the data. [derived: MCAP]
 _DATA_END = 0x0F
-# A record begins with its kind and its size.
+# A record begins with its kind and its size. [derived: MCAP]
 _HEAD = struct.Struct('<BQ')
-# A message begins with its channel, its number, and the times of log and of publication.
+# A message begins with its channel, its number, and the times of log and of publication. [derived:
+# MCAP]
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
-# A chunk begins with two times, size, checksum, and length of the compression's name.
+# A chunk begins with two times, size, checksum, and length of the compression's name. [derived:
+# MCAP]
 _CHUNK_HEAD = struct.Struct('<QQQII')
-# Statistics begin with six counts, and the first and the last time.
+# Statistics begin with six counts, and the first and the last time. [derived: MCAP]
 _STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
-# Statistics go on with pairs of a channel and the number of its messages.
+# Statistics go on with pairs of a channel and the number of its messages. [derived: MCAP]
 _COUNT = struct.Struct('<HQ')
-# The end of a file has a head, starts of summary and offsets, checksum, and magic.
+# The end of a file has a head, starts of summary and offsets, checksum, and magic. [derived: MCAP]
 _END = struct.Struct('<BQQQI8s')
-# A text begins with its length.
+# A text begins with its length. [derived: MCAP]
 _LENGTH = struct.Struct('<I')
-# The data of a chunk begin with their size.
+# The data of a chunk begin with their size. [derived: MCAP]
 _SIZE = struct.Struct('<Q')
 # Bytes of the longest name of a compression that is read with the head of a chunk. A shorter one
 # would refuse a name, a longer one reads more for nothing. [chosen: known names have four letters]

@@ -26,27 +26,26 @@ from rs_relpose_ros.bags.storage import Entry, message_data, StoredTopic
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
-# The names of all topics, frames and types here are [derived: interface].
-# The bags that the project writes have their images on this topic.
+# The bags that the project writes have their images on this topic. [derived: interface]
 COMPRESSED_TOPIC = '/camera/image_raw/compressed'
-# They have them on this topic if images are raw.
+# They have them on this topic if images are raw. [derived: interface]
 RAW_TOPIC = '/camera/image_raw'
-# Topic of the CameraInfo.
+# Topic of the CameraInfo. [derived: interface]
 CAMERA_INFO_TOPIC = '/camera/camera_info'
-# Topic of an IMU with one stamp for gyro and accelerometer.
+# Topic of an IMU with one stamp for gyro and accelerometer. [derived: interface]
 IMU_TOPIC = '/imu/data_raw'
-# Gyro and accelerometer of phones, which stamp them separately.
+# Gyro and accelerometer of phones, which stamp them separately. [derived: interface]
 GYRO_TOPIC = '/imu/gyro'
-# Topic of the accelerometer of phones.
+# Topic of the accelerometer of phones. [derived: interface]
 ACCEL_TOPIC = '/imu/accel'
-# Topic of the true poses of the camera.
+# Topic of the true poses of the camera. [derived: interface]
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 
-# Frame of the images.
+# Frame of the images. [derived: interface]
 CAMERA_FRAME = 'camera_optical_frame'
-# Frame of the IMU.
+# Frame of the IMU. [derived: interface]
 IMU_FRAME = 'imu_link'
-# Frame of the true poses.
+# Frame of the true poses. [derived: interface]
 WORLD_FRAME = 'world'
 
 # Delay [s] from the end of an image's readout to its receive time in a written bag. Without one,
@@ -56,15 +55,15 @@ IMAGE_DELAY = 0.005
 # reason. [chosen: drivers need 1 to 5 ms]
 IMU_DELAY = 0.002
 
-# Type of a raw image.
+# Type of a raw image. [derived: interface]
 IMAGE = 'sensor_msgs/msg/Image'
-# Type of a compressed image.
+# Type of a compressed image. [derived: interface]
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
-# Type of the intrinsics.
+# Type of the intrinsics. [derived: interface]
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
-# Type of an IMU sample.
+# Type of an IMU sample. [derived: interface]
 IMU = 'sensor_msgs/msg/Imu'
-# Type of a true pose.
+# Type of a true pose. [derived: interface]
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
 _logger = logging.getLogger(__name__)
@@ -155,7 +154,7 @@ class _TopicFinder:
         candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
         candidates = [topic for topic in candidates if topic.name == preferred] or candidates
         several = (
-            f'{self.bag} has several {content} topics, choose one with {_option(role)}'
+            f'{self.bag} has several {content} topics, choose one with {option_of(role)}'
             f'{hint}: {", ".join(map(str, candidates))}'
         )
         if role == 'truth' or not (candidates or self.complete):
@@ -169,7 +168,7 @@ class _TopicFinder:
         return candidates[0]
 
     def _chosen(self, role: str, *msgtypes: str) -> Topic | None:
-        name, option = self.names.get(role, ''), _option(role)
+        name, option = self.names.get(role, ''), option_of(role)
         if not name:
             return None
         found = [topic for topic in self.topics if topic.name.lstrip('/') == name.lstrip('/')]
@@ -238,7 +237,8 @@ class _TopicFinder:
         )
 
 
-def _option(role: str) -> str:
+def option_of(role: str) -> str:
+    """Option of the command line that chooses the topic of a role."""
     return f'--{role.replace("_", "-")}-topic'
 
 

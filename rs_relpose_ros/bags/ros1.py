@@ -29,22 +29,21 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # First bytes of a file. [derived: the format of ROS 1 bags, version 2.0]
 _MAGIC = b'#ROSBAG V2.0\n'
-# All kinds and layouts of records are [derived: the format of ROS 1 bags, version 2.0].
-# A message lies in a chunk.
+# A message lies in a chunk. [derived: the format]
 _MESSAGE = 2
-# A chunk holds compressed records.
+# A chunk holds compressed records. [derived: the format]
 _CHUNK = 5
-# An entry of the index says where a chunk lies.
+# An entry of the index says where a chunk lies. [derived: the format]
 _CHUNK_INFO = 6
-# A connection is a topic of one publisher.
+# A connection is a topic of one publisher. [derived: the format]
 _CONNECTION = 7
-# Numbers, and lengths of what follows.
+# Numbers, and lengths of what follows. [derived: the format]
 _LENGTH = struct.Struct('<I')
-# Place of a record in the file.
+# Place of a record in the file. [derived: the format]
 _PLACE = struct.Struct('<Q')
-# Time as seconds and nanoseconds.
+# Time as seconds and nanoseconds. [derived: the format]
 _TIME = struct.Struct('<II')
-# Connection and the number of its messages in a chunk.
+# Connection and the number of its messages in a chunk. [derived: the format]
 _COUNT = struct.Struct('<II')
 # Bytes of the largest header of a record that is read. [chosen: that of a connection holds a
 # topic's name, the others less than 100 bytes]

@@ -45,7 +45,7 @@ from rs_relpose_ros.output_files import (
     written,
 )
 
-# Help of the command, with what it writes.
+# Help of the command, with what it writes. [derived: interface]
 HELP = (
     'Run check, calibrate or replay over many bags: on processes of this machine, one thread '
     'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
@@ -63,18 +63,23 @@ PICTURE_FILE = 'overview.png'
 # File of one bag that says how its work ended and on what that depends. [derived: interface]
 _JOB_FILE = 'job.json'
 
-# How the work on a bag ended.
+# State of a bag whose work ended with exit code 0. [derived: interface]
 DONE = 'done'
-FINDINGS = 'findings'  # completed with exit code 1
-REFUSED = 'refused'  # bad input
-FAILED = 'failed'  # an error of the system, such as a full disk
-LOST = 'lost'  # the workers died
-# All of them, in the order of the summary.
+# It ended with exit code 1. [derived: interface]
+FINDINGS = 'findings'
+# It ended with bad input. [derived: interface]
+REFUSED = 'refused'
+# It ended with an error of the system, such as a full disk. [derived: interface]
+FAILED = 'failed'
+# It did not end: the workers died. [derived: interface]
+LOST = 'lost'
+# All states in the order of the summary. [derived: interface]
 STATES = (DONE, FINDINGS, REFUSED, FAILED, LOST)
-# States that another run would not change.
+# States that another run would not change. [derived: system and workers may be better then]
 _LASTING = (DONE, FINDINGS, REFUSED)
 
-# Command -> its results as in its JSON file; that of `check` is written here.
+# Commands, and their results as in their JSON files. That of `check` is written here. [derived:
+# interface]
 _WORK: Mapping[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
     'check': lambda args: inspect_bag(args).to_mapping(),
     'calibrate': lambda args: as_mapping(*calibrate_bag(args)),
@@ -86,7 +91,7 @@ _MOST_LINES = 20
 # A bag is given up when one more worker than this has died over it: a second death is no accident.
 # [chosen: each more costs the time of a run and a worker]
 _ALLOWED_DEATHS = 1
-# What is said without Dask.
+# Text of the error without Dask. [derived: text for people]
 _ABSENT = "many bags need Dask, which is not installed: pip install 'dask[distributed]'"
 # Longest time to find a scheduler and its workers [s]. A cluster takes seconds to start; a wrong
 # address is reported after this time. [chosen: any value in 10..60 would do]
@@ -237,22 +242,21 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
             if (path / 'metadata.yaml').is_file() or path.suffix in SUFFIXES
         )
         for path in matching or [Path(pattern)]:
-            states = [
-                file.stat()
-                for file in (path.iterdir() if path.is_dir() else [path])
-                if file.is_file()
-            ]
-            text = path.with_name(f'{path.name if path.is_dir() else path.stem}.yaml')
-            found.setdefault(
-                str(path),
-                Bag(
-                    str(path),
-                    sum(state.st_size for state in states) if states else -1,
-                    max((state.st_mtime_ns for state in states), default=0),
-                    text.read_text(encoding='utf-8', errors='replace') if text.is_file() else '',
-                ),
-            )
+            found.setdefault(str(path), _bag_at(path))
     return list(found.values())
+
+
+def _bag_at(path: Path) -> Bag:
+    files = path.iterdir() if path.is_dir() else [path]
+    states = [file.stat() for file in files if file.is_file()]
+    beside = path.with_name(f'{path.name if path.is_dir() else path.stem}.yaml')
+    has_parameters = beside.is_file()
+    return Bag(
+        str(path),
+        sum(state.st_size for state in states) if states else -1,
+        max((state.st_mtime_ns for state in states), default=0),
+        beside.read_text(encoding='utf-8', errors='replace') if has_parameters else '',
+    )
 
 
 def unique_names(paths: Sequence[str]) -> list[str]:
@@ -261,7 +265,8 @@ def unique_names(paths: Sequence[str]) -> list[str]:
     common = os.path.commonpath([bag.parent for bag in bags])
     long = [bag.relative_to(common) for bag in bags]
     short = [name.with_suffix('') if name.suffix in SUFFIXES else name for name in long]
-    return ['__'.join(name.parts) for name in (short if len({*short}) == len(short) else long)]
+    names = short if len({*short}) == len(short) else long
+    return ['__'.join(name.parts) for name in names]
 
 
 def make_jobs(
@@ -276,15 +281,11 @@ def make_jobs(
     bags: list[Bag] = client.submit(find_bags, paths, pure=False).result()
     if all(bag.size < 0 for bag in bags):
         raise MissingInputError(f'the workers find no bag at {", ".join(paths)}')
+    names = unique_names([bag.path for bag in bags])
+    if parameters is not None:
+        bags = [bag._replace(parameters=parameters) for bag in bags]
     return [
-        Job(
-            command,
-            bag if parameters is None else bag._replace(parameters=parameters),
-            name,
-            options,
-            version,
-        )
-        for bag, name in zip(bags, unique_names([bag.path for bag in bags]), strict=True)
+        Job(command, bag, name, options, version) for bag, name in zip(bags, names, strict=True)
     ]
 
 
@@ -300,7 +301,9 @@ def run_job(job: Job) -> tuple[Row, Files]:
             parameters = Path(scratch, 'parameters.yaml')
             parameters.write_text(job.bag.parameters, encoding='utf-8')
             words += ['--params', str(parameters)]
-        words += [*(['--out', str(out)] if job.command != 'check' else []), *job.options]
+        if job.command != 'check':
+            words += ['--out', str(out)]
+        words += job.options
         arguments, sys.argv = sys.argv, ['rs_relpose', *words]  # for summary.json
         try:
             with redirect_stderr(io.StringIO()):
@@ -317,17 +320,15 @@ def run_job(job: Job) -> tuple[Row, Files]:
             state, message = FAILED, str(error)
         finally:
             sys.argv = arguments
-        files |= {
-            str(file.relative_to(out)): file.read_bytes()
-            for file in sorted(out.rglob('*'))
-            if file.is_file()
-        }
+        written_files = [file for file in sorted(out.rglob('*')) if file.is_file()]
+        files |= {str(file.relative_to(out)): file.read_bytes() for file in written_files}
     return job.row(state, message, time.perf_counter() - started, metrics), files
 
 
 # -- Columns of the table, and messages, from the results of one bag ------------------------------
 
-# Parameters of a calibration that are one number: value, sigma, observable, remark.
+# Parameters of a calibration that are one number, with value, sigma, observable and remark.
+# [derived: calibration.json]
 _CALIBRATED = (
     'readout_time_s',
     'time_offset_s',
@@ -336,10 +337,10 @@ _CALIBRATED = (
     'gyro_bias_rad_per_s.1',
     'gyro_bias_rad_per_s.2',
 )
-# The parameter that is a rotation vector.
+# The parameter that is a rotation vector. [derived: calibration.json]
 _ROTATION = 'rotation_from_axis_map_rad'
 
-# Command -> column -> place in the results.
+# Columns of each command, with their places in its results. [derived: interface]
 _COLUMNS: Mapping[str, Mapping[str, str]] = {
     'calibrate': {
         'shutter': 'shutter',
@@ -408,10 +409,8 @@ def _problems(command: str, results: Mapping[str, Any]) -> str:
             if finding['verdict'] == 'failure'
         ]
     elif command == 'calibrate':
-        parts = {
-            **{name: _at(results, name) for name in _CALIBRATED},
-            'rotation': results[_ROTATION],
-        }
+        parts = {name: _at(results, name) for name in _CALIBRATED}
+        parts['rotation'] = results[_ROTATION]
         problems = [
             f'{name} is not observable: {part["remark"]}'
             for name, part in parts.items()
@@ -424,11 +423,8 @@ def _problems(command: str, results: Mapping[str, Any]) -> str:
             if finding['state'] == 'wrong'
         ]
         if not results['pairs']['answered']:
-            counts = [
-                f'{count} {status}'
-                for status, count in results['pairs']['by_status'].items()
-                if count
-            ]
+            by_status = results['pairs']['by_status']
+            counts = [f'{count} {status}' for status, count in by_status.items() if count]
             problems.append(f'no pair has a pose: {", ".join(counts) or "there was none"}')
     return '; '.join(problems)
 
@@ -486,10 +482,12 @@ def run_jobs(
     distributed = library('distributed', _ABSENT)
     folder.mkdir(parents=True, exist_ok=True)
     rows = {job: row for job in jobs if (row := earlier(job, folder)) is not None}
-    waiting = [job for job in reversed(jobs) if job not in rows]
-    reused, running, finished = len(rows), dict[Any, Job](), distributed.as_completed()
+    reused = len(rows)
     for _ in rows:
         on_bag()
+    waiting = [job for job in reversed(jobs) if job not in rows]
+    running: dict[Any, Job] = {}
+    finished = distributed.as_completed()
 
     def fill() -> None:
         # A job that is queued at a worker would die with the one that is running there.
@@ -525,13 +523,12 @@ def run_jobs(
 
 def earlier(job: Job, folder: Path) -> Row | None:
     """The row of an earlier run of the same job, if another run would not change it."""
+    own = folder / job.name
     with suppress(OSError, ValueError, KeyError, TypeError):
-        entry = json.loads((folder / job.name / _JOB_FILE).read_text(encoding='utf-8'))
-        if (
-            entry['fingerprint'] == job.fingerprint
-            and entry['row']['state'] in _LASTING
-            and all((folder / job.name / name).is_file() for name in entry['files'])
-        ):
+        entry = json.loads((own / _JOB_FILE).read_text(encoding='utf-8'))
+        is_same = entry['fingerprint'] == job.fingerprint
+        has_files = all((own / name).is_file() for name in entry['files'])
+        if is_same and has_files and entry['row']['state'] in _LASTING:
             return dict(entry['row'])
     return None
 
@@ -543,7 +540,8 @@ def store(job: Job, row: Row, files: Files, folder: Path) -> None:
         shutil.rmtree(own)
     own.mkdir(exist_ok=True)
     entry = {'fingerprint': job.fingerprint, 'row': row, 'files': sorted(files)}
-    for name, data in {**files, _JOB_FILE: json.dumps(entry, indent=1).encode() + b'\n'}.items():
+    text = json.dumps(entry, indent=1) + '\n'
+    for name, data in (*files.items(), (_JOB_FILE, text.encode())):
         (own / name).parent.mkdir(parents=True, exist_ok=True)
         with written(own / name, 'wb') as file:
             file.write(data)
@@ -551,10 +549,9 @@ def store(job: Job, row: Row, files: Files, folder: Path) -> None:
 
 def write_table(rows: Sequence[Row], folder: Path) -> None:
     """One row for each bag; metrics that a bag does not have are empty."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
     with written(folder / RESULTS_FILE) as file:
-        table = csv.DictWriter(
-            file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator='\n'
-        )
+        table = csv.DictWriter(file, columns, lineterminator='\n')
         table.writeheader()
         table.writerows(rows)
 
@@ -624,28 +621,34 @@ def weighted_mean(
     others, its own sigma included, and two others remain. `sigma`: by the measurements' own ones,
     times sqrt(chi2/dof) if that is above 1; `chi2`: without the outliers.
     """
-    x, s = np.asarray(values, dtype=np.float64), np.asarray(sigmas, dtype=np.float64)
+    x = np.asarray(values, dtype=np.float64)
+    s = np.asarray(sigmas, dtype=np.float64)
     kept = list(range(len(x)))
 
     def mean_of(some: list[int]) -> tuple[float, float]:
         weights = s[some] ** -2.0
-        return float((weights * x[some]).sum() / weights.sum()), float(weights.sum() ** -0.5)
+        whole = weights.sum()
+        return float((weights * x[some]).sum() / whole), float(whole**-0.5)
+
+    def distance(one: int) -> float:
+        mean, sigma = mean_of([i for i in kept if i != one])
+        return float(abs(x[one] - mean) / np.hypot(s[one], sigma))
 
     while len(kept) > 2:
-        others = [mean_of([i for i in kept if i != one]) for one in kept]
-        distances = [
-            abs(x[one] - mean) / np.hypot(s[one], sigma)
-            for one, (mean, sigma) in zip(kept, others, strict=True)
-        ]
-        if max(distances) <= _OUTLIER:
+        worst = max(kept, key=distance)
+        if distance(worst) <= _OUTLIER:
             break
-        del kept[int(np.argmax(distances))]
+        kept.remove(worst)
     mean, sigma = mean_of(kept)
-    chi2, degrees = float((((x[kept] - mean) / s[kept]) ** 2).sum()), len(kept) - 1
+    residuals = (x[kept] - mean) / s[kept]
+    chi2 = float((residuals**2).sum())
+    degrees = len(kept) - 1
+    if degrees:
+        sigma *= math.sqrt(max(1.0, chi2 / degrees))
     return {
         'figure': metric,
         'mean': mean,
-        'sigma': sigma * math.sqrt(max(1.0, chi2 / degrees)) if degrees else sigma,
+        'sigma': sigma,
         'chi2': chi2,
         'degrees_of_freedom': degrees,
         'bags': list(bags),
@@ -694,7 +697,8 @@ def combine(rows: Sequence[Row]) -> dict[str, Any]:
     return {'figures': combined, 'quat_cam_imu_xyzw': quaternion}
 
 
-# The two columns of each command that are drawn, their factors and labels.
+# The two columns of each command that are drawn, their factors and labels. [chosen: what a person
+# looks for first]
 _DRAWN = {
     'check': (('failure', 1.0, 'failures'), ('warning', 1.0, 'warnings')),
     'calibrate': (
@@ -713,37 +717,29 @@ def draw(
 ) -> None:
     """Draw rows in their order; red: outliers of the mean, orange: unobservable values."""
     picture = Figure(figsize=(10.0, 1.2 + 0.3 * len(rows)), dpi=110, layout='constrained')
-    both, means = picture.subplots(1, 2, sharey=True), {one['figure']: one for one in combined}
+    both = picture.subplots(1, 2, sharey=True)
+    means = {one['figure']: one for one in combined}
     for axes, (column, factor, label) in zip(both, _DRAWN[command], strict=True):
         outliers: Sequence[str] = ()
         if column in means:
-            mean, sigma, outliers = (means[column][key] for key in ('mean', 'sigma', 'outliers'))
+            mean, sigma = means[column]['mean'], means[column]['sigma']
+            outliers = means[column]['outliers']
             axes.axvline(factor * mean, color=BLUE, linewidth=1.0)
             axes.axvspan(factor * (mean - sigma), factor * (mean + sigma), color=BLUE, alpha=0.2)
         for y, row in enumerate(rows):
-            if row.get(column) is not None:
-                colour = (
-                    ORANGE
-                    if not row.get(f'{column}_observable', True)
-                    else RED
-                    if row['name'] in outliers
-                    else BLUE
-                )
-                axes.errorbar(
-                    factor * row[column],
-                    y,
-                    fmt='o',
-                    color=colour,
-                    xerr=factor * row.get(f'{column}_sigma', 0.0),
-                )
+            if row.get(column) is None:
+                continue
+            colour = RED if row['name'] in outliers else BLUE
+            if not row.get(f'{column}_observable', True):
+                colour = ORANGE
+            sigma = factor * row.get(f'{column}_sigma', 0.0)
+            axes.errorbar(factor * row[column], y, fmt='o', color=colour, xerr=sigma)
         axes.set_xlabel(label)
         axes.grid(axis='x', color='0.9')
-    both[0].set_yticks(
-        range(len(rows)),
-        [
-            row['name'][-40:] + ('' if row['state'] in (DONE, FINDINGS) else f' ({row["state"]})')
-            for row in rows
-        ],
-    )
+    labels = [
+        row['name'][-40:] + ('' if row['state'] in (DONE, FINDINGS) else f' ({row["state"]})')
+        for row in rows
+    ]
+    both[0].set_yticks(range(len(rows)), labels)
     both[0].set_ylim(len(rows) - 0.4, -0.6)
     save_picture(picture, path)

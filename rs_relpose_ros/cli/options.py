@@ -35,7 +35,7 @@ Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
 # Arguments of a command by name, with what `ArgumentParser.add_argument` takes.
 Arguments = Mapping[str, Mapping[str, Any]]
 
-# The bag that a command reads.
+# The bag that a command reads. [derived: interface]
 BAG: Arguments = {
     'bag': {
         'metavar': 'BAG',
@@ -43,7 +43,7 @@ BAG: Arguments = {
         'help': 'rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file',
     }
 }
-# The parameters of the node.
+# The parameters of the node. [derived: interface]
 PARAMETERS: Arguments = {
     '--params': {
         'metavar': 'FILE',
@@ -57,7 +57,8 @@ PARAMETERS: Arguments = {
         'help': 'set a parameter, after --params; may be repeated',
     },
 }
-# A topic for each field of `SensorTopics`; the help shows them as a group of their own.
+# A topic for each field of `SensorTopics`. The help shows them as a group of their own. [derived:
+# interface]
 TOPICS: Arguments = {
     f'--{role}-topic': {'metavar': 'TOPIC', 'default': '', 'help': text}
     for role, text in {
@@ -68,7 +69,7 @@ TOPICS: Arguments = {
         'truth': 'PoseStamped: ground truth of the camera',
     }.items()
 }
-# The topics of a command that has no use for the ground truth.
+# The topics of a command that has no use for the ground truth. [derived: interface]
 SENSOR_TOPICS = {name: values for name, values in TOPICS.items() if name != '--truth-topic'}
 
 

@@ -8,7 +8,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, option_of, SensorTopics
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
 from rs_relpose_ros.config.files import file_values, read_parameters
@@ -55,7 +55,7 @@ def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     words = ['calibrate', str(args.bag), '--out', str(folder)]
     for role, topic in options.topic_options(args).items():
         if topic and role in ('image', 'camera_info', 'imu'):
-            words += [f'--{role.replace("_", "-")}-topic', topic]
+            words += [option_of(role), topic]
     result, _ = calibrate_bag(make_parser('calibrate').parse_args(words))
     if not result.complete:
         reasons = dict.fromkeys(part.remark for part in result.needed if not part.determined)
@@ -68,9 +68,14 @@ def _replay(args: argparse.Namespace) -> int:
     metrics = outcome.metrics
     options.warn_unused(metrics['not_used'])
     _print_replay(outcome)
-    print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
+    _print_files(folder, outcome)
     good = metrics['pairs']['answered'] and metrics['health']['state'] != 'wrong'
     return 0 if good else FAILED
+
+
+def _print_files(folder: Path, outcome: replay.ReplayOutcome) -> None:
+    names = [path.name for path in outcome.files]
+    print(f'in {folder}: {", ".join([*names, SUMMARY_FILE])}')
 
 
 def _print_replay(outcome: replay.ReplayOutcome) -> None:
@@ -135,7 +140,7 @@ def _text(value: Any, unit: str) -> str:
     return f'no {unit}' if value is None else f'{value:.3g} {unit}'
 
 
-# `rs_relpose replay`.
+# The command `rs_relpose replay`. [derived: interface]
 REPLAY = Command(
     'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
     '1) with the pipeline of relpose_node. Topics are found by type where that is unambiguous. '
@@ -193,11 +198,11 @@ def _pairs(args: argparse.Namespace) -> int:
     if len(reasons) > _MOST_REASONS:
         print(f'{len(reasons) - _MOST_REASONS} more reasons: column reason of {POSES.file}')
     _print_errors(outcome.metrics['errors_against_truth'])
-    print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
+    _print_files(folder, outcome)
     return 0 if counts['answered'] else FAILED
 
 
-# `rs_relpose pairs`.
+# The command `rs_relpose pairs`. [derived: interface]
 PAIRS = Command(
     "Estimate the relative poses of chosen pairs of a bag's images, any distance apart: loop "
     'closures, wide baselines. Images are matched by descriptors (SIFT, or ORB with --set '
@@ -284,7 +289,7 @@ def _odometry(args: argparse.Namespace) -> int:
     return 0
 
 
-# `rs_relpose odometry`.
+# The command `rs_relpose odometry`. [derived: interface]
 ODOMETRY = Command(
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
     'graph (gtsam, an extra), as in odometry_node. Writes trajectory.tum (live estimates of the '
@@ -378,7 +383,7 @@ def _print_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 
 
-# `rs_relpose export`.
+# The command `rs_relpose export`. [derived: interface]
 EXPORT = Command(
     'Export a bag for reconstruction and splatting: images, cameras with the pose of each row or '
     'what the format has for it, and points, metric with z up. Poses are those of `rs_relpose '

@@ -139,7 +139,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 # Distortion model that --lens estimates if none is named. [derived: interface]
 _USUAL_LENS = 'plumb_bob'
 
-# `rs_relpose calibrate`.
+# The command `rs_relpose calibrate`. [derived: interface]
 CALIBRATE = Command(
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
     'without a target: readout time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
@@ -229,7 +229,7 @@ def _check(args: argparse.Namespace) -> int:
     return FAILED if report.failed else 0
 
 
-# `rs_relpose check`.
+# The command `rs_relpose check`. [derived: interface]
 CHECK = Command(
     'Check a bag (rosbag2 or ROS 1) for defects that degrade relative poses: topics, rates, gaps, '
     'stamps, clocks, encodings, transport; and, by a test run of half a minute of it, axes, time '
@@ -268,7 +268,7 @@ def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
     return read
 
 
-# Logger of phones, as named in `FORMATS`, and its reader.
+# Loggers of phones, as named in `FORMATS`, and their readers. [derived: interface]
 PHONES: Mapping[str, phone.Reader] = {
     'PoseCam': android.read_posecam,
     'MARS Logger': android.read_mars,
@@ -279,6 +279,7 @@ PHONES: Mapping[str, phone.Reader] = {
     'Sensor Logger': apple.read_sensor_logger,
     'tables': phone.read_tables,
 }
+# The logger of a phone is recognised by its files. [derived: `FORMATS`]
 _PHONE = Source(
     "folder of a phone's logger, recognised by its files: "
     + '; '.join(str(one) for one in FORMATS if one.name in PHONES),
@@ -399,7 +400,7 @@ def _convert(args: argparse.Namespace) -> int:
     return 0
 
 
-# `rs_relpose convert`.
+# The command `rs_relpose convert`. [derived: interface]
 CONVERT = Command(
     'Convert a recording to a rosbag2 directory (MCAP) with /camera/image_raw/compressed, '
     '/imu/data_raw (or /imu/gyro and /imu/accel if they have separate stamps), '
@@ -434,7 +435,7 @@ def _unroll(args: argparse.Namespace) -> int:
     return 0
 
 
-# `rs_relpose unroll`.
+# The command `rs_relpose unroll`. [derived: interface]
 UNROLL = Command(
     'Derotate every image of a bag (rosbag2 or ROS 1) by its gyro to the time of its middle row, '
     'and write a bag (MCAP) for SLAM systems without a model of the rolling shutter: images and '

@@ -12,12 +12,12 @@ import time
 from typing import NamedTuple, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.calibration import findings_text
 from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
 from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
@@ -33,10 +33,14 @@ PATIENCE = 5.0
 # Share of the images whose refusal is the reason for no result. A smaller one would name refusals
 # beside which pairs without a pose are the true reason. [chosen: 0.6 to 0.95 would do]
 _MOST = 0.8
-# Share of the images of an even rhythm below which images are lost, and fewest images that show
-# it. [chosen: transport that works loses a few per cent, Fast DDS with large messages most]
+# Share of the images of an even rhythm below which images are lost. A larger one would warn of a
+# camera that pauses. [chosen: transport that works loses a few per cent, Fast DDS with large
+# messages most]
 _LOST = 0.7
+# Fewest images of which lost ones and jitter are reported. Fewer show no rhythm. [chosen: 5 to 30
+# would do]
 _FEWEST = 10
+# Ending of the topics of compressed images. [derived: image_transport]
 _COMPRESSED = '/compressed'
 # Jitter of stamps that is reported [s]. At 1 rad/s and f = 500 px it displaces points by 0.25 px,
 # half the noise of a match. [derived: from that; half and double of it would do]
@@ -107,18 +111,18 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
 
     `stamps_ns`: of the recent images; `size`: of an image [bytes].
     """
-    recent = np.array(
-        [stamp for stamp in stamps_ns if stamp > stamps_ns[-1] - PATIENCE * NANOSECONDS]
-    )
+    recent = np.array(stamps_ns, dtype=np.int64)
+    recent = recent[recent > recent[-1:] - PATIENCE * NANOSECONDS]
     if len(recent) < _FEWEST:
         return ''
     steps = np.diff(recent) / NANOSECONDS
     # A quarter of the intervals has no lost image between, unless most images are lost.
     period = max(float(np.quantile(steps, 0.25, method='lower')), 1e-9)
     sent = 1e-9 * (recent[-1] - recent[0]) / period + 1.0
-    if size >= LARGE_MESSAGE and len(recent) < _LOST * sent:
+    arrived = len(recent) / sent
+    if size >= LARGE_MESSAGE and arrived < _LOST:
         return (
-            f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
+            f'about {100.0 * (1.0 - arrived):.0f} % of the images, of '
             f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. '
             'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
             '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
@@ -140,24 +144,29 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
 
 # -- Fields of /diagnostics -----------------------------------------------------------------------
 
-# Levels of diagnostic_msgs/DiagnosticStatus.
+# Level of a status without a fault. [derived: diagnostic_msgs/DiagnosticStatus]
 OK = 0
+# Level of a warning. [derived: the same]
 WARN = 1
+# Level of an error. [derived: the same]
 ERROR = 2
+# Text while the worker compiles. [derived: interface]
 STARTING = 'starting: kernels are compiled or loaded'
-# Task in the name of the status of relpose_node.
+# Task in the name of the status of relpose_node. [derived: interface]
 RELATIVE_POSE = 'relative pose'
 
-# Numbers of the latest results and frames over which latency and time per frame are taken: half a
-# minute. Fewer leave the 99th percentile to three values, more hide a change.
-# [chosen: half to four times would do]
+# Number of the latest results over which the latency is taken: half a minute. Fewer leave the 99th
+# percentile to three values, more hide a change. [chosen: half to four times would do]
 _RECENT_RESULTS = 300
+# Number of the latest frames over which the time per frame is taken, for the same reasons.
+# [chosen: half to four times would do]
 _RECENT_FRAMES = 900
 # Time without a message [s] after which an input counts as missing. Less would report slow
 # cameras. [chosen: 1 to 5 s would do]
 SILENCE = 2.0
-# Topics of the nodes in the order of /diagnostics, and the key of unusable messages.
+# Topics of the nodes in the order of /diagnostics. [derived: interface]
 TOPICS = (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
+# Key of the number of unusable messages. [derived: no role has it]
 INVALID = 'invalid'
 
 
@@ -171,7 +180,7 @@ class Report:
     silence: Silence  # ends with a result
 
 
-# Counters of `SequencerCounts`.
+# Counters of `SequencerCounts` on /diagnostics. [derived: interface]
 _COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'imu_wild', 'clock_jumps')
 
 
@@ -179,11 +188,12 @@ def _ms(seconds: float) -> str:
     return f'{1e3 * seconds:.2f}'
 
 
-def _vector(values: NDArray[np.float64]) -> str:
+def _vector(values: Array) -> str:
     return ' '.join(f'{value:.5f}' for value in values)
 
 
-# Tracked calibration and applied corrections, to be compared with the parameters.
+# Tracked calibration and applied corrections, to be compared with the parameters. [derived:
+# interface]
 _TRACKED: dict[str, Callable[[Tracked, Applied], str]] = {
     'tracked_gyro_bias_rad_s': lambda tracked, _: _vector(tracked.gyro_bias),
     'tracked_gyro_bias_sigma_rad_s': lambda tracked, _: _vector(tracked.gyro_bias_sigma),
@@ -268,19 +278,18 @@ class FrameStatistics(ABC):
             before, self._since_ns, self._counted = self._counted, now_ns, inputs
             refused = Counter({} if counts is None else counts.refused)
             dropped, self._refused = refused - self._refused, refused
-            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
-            taken = counts.frames_taken if counts else 0
+            taken = 0 if counts is None else counts.frames_taken
             used, self._taken = taken - self._taken, taken
+            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
             if not problem and dropped and used <= 0:
                 problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
-            level, text = (
-                self._evaluate(problem, dropped) if progress is None else (OK, progress.text)
-            )
+            level, text = self._evaluate(problem, dropped)
+            if progress is not None:
+                level, text = OK, progress.text
             if warning and level == OK:
                 level, text = WARN, warning
-            state = (
-                self.idle if problem else {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level]
-            )
+            by_level = {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}
+            state = self.idle if problem else by_level[level]
             values: dict[str, object] = {'state': state, 'missing': ', '.join(missing)}
             if progress is not None:
                 share = f'{100.0 * progress.share:.0f}'
@@ -296,9 +305,8 @@ class FrameStatistics(ABC):
             values['worker_busy_percent'] = f'{100.0 * busy:.0f}'
             values[self.last] = self._last_failure.text if self._last_failure else ''
             silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
-        return Report(
-            level, text, tuple((name, str(value)) for name, value in values.items()), silence
-        )
+        texts = tuple((name, str(value)) for name, value in values.items())
+        return Report(level, text, texts, silence)
 
     def _counters(
         self, counts: SequencerCounts | None, refused: Counter[Refusal], invalid: int
@@ -338,8 +346,10 @@ class FrameStatistics(ABC):
         if level == ERROR or not dropped:
             return level, text
         kinds = ', '.join(f'{count} {kind.value}' for kind, count in dropped.most_common())
-        why = ': the worker is too slow for the camera' if dropped[Refusal.OVERLOAD] else ''
-        return WARN, f'{dropped.total()} frames were not used since the last report ({kinds}){why}'
+        text = f'{dropped.total()} frames were not used since the last report ({kinds})'
+        if dropped[Refusal.OVERLOAD]:
+            text += ': the worker is too slow for the camera'
+        return WARN, text
 
     def _published(self, ready_ns: int) -> None:
         """Add the latency of a result with all data at `ready_ns`; call it under the lock."""
@@ -363,6 +373,13 @@ def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
         return '', ''
     median, p99 = 1e3 * np.percentile(list(seconds), (50, 99))
     return f'{median:.1f}', f'{p99:.1f}'
+
+
+def evaluate_faults(health: Assessment) -> tuple[int, str]:
+    """Level and text of a calibration with faults: those of the worst one."""
+    worst = health.faults[0]
+    level = ERROR if worst.state is FindingState.WRONG else WARN
+    return level, findings_text.line(worst)
 
 
 class Statistics(FrameStatistics):
@@ -394,8 +411,7 @@ class Statistics(FrameStatistics):
         if last is None:
             return OK, 'no keyframe pair yet'
         if last.health.faults:
-            worst = last.health.faults[0]
-            return ERROR if worst.state is FindingState.WRONG else WARN, findings_text.line(worst)
+            return evaluate_faults(last.health)
         if not last.pose:
             return WARN, f'no pose of the last pair: {last.pose.status.value}: {last.pose.reason}'
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
@@ -420,6 +436,7 @@ class Statistics(FrameStatistics):
 
 # -- Files with a line per frame ------------------------------------------------------------------
 
+# Columns of the file of `FrameTimings`. [derived: interface]
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
 
 
@@ -547,18 +564,12 @@ class HealthLog:
                 # A gross error has a fix of its own, unlike the first small steps.
                 kind += ', gross'
             if health.state is FindingState.WRONG:
-                self._error(
-                    f'{text}; '
-                    + (
-                        f'{self._results} are suppressed: withhold_when_wrong: false publishes '
-                        f'them '
-                        'all the same'
-                        if withhold
-                        else f'{self._results} are published all the same, '
-                        'as withhold_when_wrong is false'
-                    ),
-                    kind,
-                )
+                effect = 'are published all the same, as withhold_when_wrong is false'
+                if withhold:
+                    effect = (
+                        'are suppressed: withhold_when_wrong: false publishes them all the same'
+                    )
+                self._error(f'{text}; {self._results} {effect}', kind)
             else:
                 self._warn(text, kind)
         elif self._reported_faults:

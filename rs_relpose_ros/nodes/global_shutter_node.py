@@ -15,12 +15,11 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.nodes.diagnostics import (
-    ERROR,
+    evaluate_faults,
     FrameStatistics,
     HealthLog,
     OK,
     RELATIVE_POSE,
-    WARN,
 )
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
@@ -36,7 +35,7 @@ NAME = 'global_shutter_node'
 _DEPTH = 10
 # Largest age of a state of relpose_node [s], which comes once a second. [chosen: two may be lost]
 _FRESH = 3.0
-# What --help prints.
+# What --help prints. [derived: the topics and services below]
 _DESCRIPTION = (
     'Derotated images of a rolling-shutter camera: every row rotated by the gyro to the time of\n'
     'the middle one.\n\n'
@@ -85,22 +84,22 @@ class _Statistics(FrameStatistics):
             self._published(ready_ns)
 
     def _evaluate_results(self) -> tuple[int, str]:
-        if faults := self._health.faults:
-            level = ERROR if faults[0].state is FindingState.WRONG else WARN
-            return level, findings_text.line(faults[0])
+        if self._health.faults:
+            return evaluate_faults(self._health)
         return OK, f'publishing: {self._images} images' if self._images else 'no image yet'
 
     def _values(self) -> dict[str, object]:
-        last = self._last
+        shift = offset = ''
+        if self._last is not None:
+            shift = f'{self._last.map.shift:.1f}'
+            offset = f'{1e-6 * self._last.applied_offset_ns:.2f}'
         return {
             'images_published': self._images,
             'images_withheld': self._withheld,
             'health': self._health.state.value,
             'health_source': self._source,
-            'largest_shift_px': '' if last is None else f'{last.map.shift:.1f}',
-            'applied_time_offset_ms': ''
-            if last is None
-            else f'{1e-6 * last.applied_offset_ns:.2f}',
+            'largest_shift_px': shift,
+            'applied_time_offset_ms': offset,
         }
 
 
@@ -126,15 +125,10 @@ class GlobalShutterNode(SensorNode):
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
 
-        self._image, self._compressed, self._mask, self._camera_info = (
-            publisher(f'sensor_msgs/msg/{name}', f'~/{topic}')
-            for name, topic in (
-                ('Image', 'image'),
-                ('CompressedImage', 'image/compressed'),
-                ('Image', 'mask'),
-                ('CameraInfo', 'camera_info'),
-            )
-        )
+        self._image = publisher('sensor_msgs/msg/Image', '~/image')
+        self._compressed = publisher('sensor_msgs/msg/CompressedImage', '~/image/compressed')
+        self._mask = publisher('sensor_msgs/msg/Image', '~/mask')
+        self._camera_info = publisher('sensor_msgs/msg/CameraInfo', '~/camera_info')
         self._log_health = HealthLog(self._info, self._warn, self._error, 'images')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
@@ -165,12 +159,9 @@ class GlobalShutterNode(SensorNode):
         """Keep the state of relpose_node on the same images."""
         own = self._image_topic().removesuffix('/compressed')
         for status in message.status:
-            if not (
-                status.name.endswith(f': {RELATIVE_POSE}')
-                and status.hardware_id.removesuffix('/compressed') == own
-            ):
+            node, _, task = status.name.rpartition(': ')
+            if task != RELATIVE_POSE or status.hardware_id.removesuffix('/compressed') != own:
                 continue
-            node = status.name.removesuffix(f': {RELATIVE_POSE}')
             try:
                 self._of_others = time.monotonic(), assessment_of(status), node
             except InputError as error:
@@ -178,30 +169,23 @@ class GlobalShutterNode(SensorNode):
 
     def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""
-        stamp_ns, frame_id, intrinsics = frame.stamp_ns, frame.frame_id, frame.intrinsics
-        raw, compressed, mask = (
-            topic.get_subscription_count() for topic in (self._image, self._compressed, self._mask)
-        )
+        origin = frame.stamp_ns, frame.frame_id
+        raw = self._image.get_subscription_count()
+        compressed = self._compressed.get_subscription_count()
         if raw or compressed:
             pixels = frame.image()
             if raw:
-                self._image.publish(
-                    outgoing.image_message(stamp_ns, frame_id, pixels, message_class)
-                )
+                self._image.publish(outgoing.image_message(*origin, pixels, message_class))
             if compressed:
-                self._compressed.publish(
-                    outgoing.compressed_image_message(
-                        stamp_ns, frame_id, pixels, png=frame.is_png, types=message_class
-                    )
+                message = outgoing.compressed_image_message(
+                    *origin, pixels, png=frame.is_png, types=message_class
                 )
-        published = self._intake.camera_info_of(intrinsics)
-        self._camera_info.publish(
-            outgoing.camera_info_message(stamp_ns, frame_id, intrinsics, published, message_class)
-        )
-        if mask:
-            self._mask.publish(
-                outgoing.image_message(stamp_ns, frame_id, frame.mask(), message_class)
-            )
+                self._compressed.publish(message)
+        published = self._intake.camera_info_of(frame.intrinsics)
+        info = outgoing.camera_info_message(*origin, frame.intrinsics, published, message_class)
+        self._camera_info.publish(info)
+        if self._mask.get_subscription_count():
+            self._mask.publish(outgoing.image_message(*origin, frame.mask(), message_class))
 
 
 main = partial(run_node, GlobalShutterNode, NAME, _DESCRIPTION)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # -- rclpy ----------------------------------------------------------------------------------------
 
-# Errors of rclpy if a signal has ended the context during a call.
+# Errors of rclpy if a signal has ended the context during a call. [derived: rclpy]
 SHUT_DOWN = (rclpy_implementation.RCLError, InvalidHandle)
 
 
@@ -121,7 +121,7 @@ _IMAGE_DEPTH = 15
 # process is stalled. [chosen: a sample has 0.3 kB, so that ten times as many would do, too]
 _IMU_DEPTH = 2000
 # QoS of messages that are published once, before this node starts: the middleware sends them to
-# reliable subscriptions of the same durability only.
+# reliable subscriptions of the same durability only. [derived: ROS]
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )

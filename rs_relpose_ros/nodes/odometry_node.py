@@ -26,14 +26,17 @@ from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.pair import warm_up_odometry
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, OdometryState
 
+# Name of the node. [derived: interface]
 NAME = 'odometry_node'
 
-# Topic of the pairs, below the node's namespace.
+# Topic of the pairs, below the node's namespace. [derived: interface]
 _PAIRS = 'relpose_node/pairs'
-# Queue lengths of the IMU and of other topics. The IMU is read at `_LEAST_RATE` or faster, but not
-# while a pair is added: a shorter queue would lose samples of a slow machine, a longer one costs
-# memory. [chosen: 10 s at 200 Hz, and 5 s of pairs at 10 Hz]
+# Queue length of the IMU. It is read at `_LEAST_RATE` or faster, but not while a pair is added: a
+# shorter queue would lose samples of a slow machine, a longer one costs memory. [chosen: 10 s at
+# 200 Hz]
 _IMU_DEPTH = 2000
+# Queue length of other topics. A shorter one would lose messages for a subscriber that pauses.
+# [chosen: 5 s of pairs at 10 Hz]
 _DEPTH = 50
 # Lowest rate [Hz] at which the IMU is read; the published rate may be lower. A lower one would
 # make the silence of the IMU known late. [chosen: 4 to 50 Hz would do]
@@ -47,14 +50,14 @@ _SILENCE = 2
 # Time without a sample after which the IMU is silent [s]. Less would report a burst of delayed
 # samples, more would propagate a path without an IMU. [chosen: 0.1 to 0.5 s would do]
 _SILENT_IMU = 0.25
-# Level of diagnostic_msgs/DiagnosticStatus by state.
+# Level of diagnostic_msgs/DiagnosticStatus by state. [derived: interface]
 _LEVELS = {
     OdometryState.STARTING: 0,
     OdometryState.TRACKING: 0,
     OdometryState.UNCERTAIN: 1,
     OdometryState.LOST: 2,
 }
-# Counters of the estimator on /diagnostics.
+# Counters of the estimator on /diagnostics. [derived: interface]
 _COUNTS = (
     'pairs',
     'contradicting',
@@ -64,6 +67,7 @@ _COUNTS = (
     'lost',
     'calibration contradicted',
 )
+# What --help prints. [derived: the topics and services below]
 _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
     f'subscribes: {_PAIRS}, imu, accel, camera_info, calibration\n'
@@ -81,9 +85,9 @@ class OdometryNode(StoppableNode):
         self.log_compiling()
         warm_up_odometry()
         self._begun = False
-        self._imu_lookup = (
-            inputs.TransformLookup(self) if self._settings.current.calibration.use_tf else None
-        )
+        self._imu_lookup: inputs.TransformLookup | None = None
+        if self._settings.current.calibration.use_tf:
+            self._imu_lookup = inputs.TransformLookup(self)
         self.use_calibrations()
         missing = self._settings.current.sensor.missing()
         if missing:
@@ -115,15 +119,14 @@ class OdometryNode(StoppableNode):
         self._sample_at = time.monotonic()
         self._frames: dict[Role, str] = {}  # of the samples
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
-        self._transforms = (
-            inputs.transform_broadcaster(self, 'publish_odometry_tf')
-            if self._config.publish_odometry_tf
-            else None
-        )
+        self._transforms: Any = None
+        if self._config.publish_odometry_tf:
+            self._transforms = inputs.transform_broadcaster(self, 'publish_odometry_tf')
         with legal_qos():
             self._open_topics()
         self.create_service(Trigger, '~/reset', self._reset)
-        steady, rate = Clock(clock_type=ClockType.STEADY_TIME), self._config.odometry_rate
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        rate = self._config.odometry_rate
         if rate > 0.0:
             self.create_timer(1.0 / rate, lambda: self._read(publish=True), clock=steady)
         if rate < _LEAST_RATE:
@@ -146,15 +149,15 @@ class OdometryNode(StoppableNode):
         samples = inputs.best_effort(_IMU_DEPTH)
         # Read as often as odometry is published: each message would wake the process.
         self._inputs = [
-            *(
-                self._polled(
-                    role.value, PARTS[role].msgtypes[0], samples, partial(self._on_sample, role)
-                )
-                for role in (Role.IMU, Role.ACCEL)
+            self._polled(
+                'imu', 'sensor_msgs/msg/Imu', samples, partial(self._on_sample, Role.IMU)
+            ),
+            self._polled(
+                'accel', 'sensor_msgs/msg/Imu', samples, partial(self._on_sample, Role.ACCEL)
             ),
             # CameraInfo shows whether the camera still delivers where no pair comes.
             self._polled(
-                Role.CAMERA_INFO.value,
+                'camera_info',
                 'sensor_msgs/msg/CameraInfo',
                 inputs.best_effort(_DEPTH),
                 lambda info: self._estimator.add_frame(stamp_ns(info.header)),
@@ -166,7 +169,8 @@ class OdometryNode(StoppableNode):
                 self._on_pair,
             ),
         ]
-        self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
+        self._pairs = self.resolve_topic_name(_PAIRS)
+        self._imu = self.resolve_topic_name('imu')
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
 
@@ -195,7 +199,8 @@ class OdometryNode(StoppableNode):
         self._continuous.reset()
         self._path.clear()
         self._frames.clear()
-        response.success, response.message = True, 'restarting with the next pair'
+        response.success = True
+        response.message = 'restarting with the next pair'
         return response
 
     def _on_pair(self, message: Any) -> None:
@@ -207,22 +212,21 @@ class OdometryNode(StoppableNode):
             return
         try:
             self._place_imu(pair.frame_id, self._frames.get(Role.IMU, ''))
-            base = self._config.base_frame
-            if self._estimator.base is None and (found := self._lookup(base, pair.frame_id)):
-                self._estimator.base = Base.of(base, found)
+            if self._estimator.base is None:
+                base = self._config.base_frame
+                found = self._lookup(base, pair.frame_id)
+                if found:
+                    self._estimator.base = Base.of(base, found)
             self._estimator.add_pair(pair)
         except RsRelposeError as error:
             self._warn(str(error))
 
     def _place_imu(self, camera: str, imu: str) -> None:
         """Position of the IMU by /tf_static, if it is there before the path begins."""
-        if (
-            self._imu_lookup is None
-            or not imu
-            or imu == camera
-            or self._estimator.starts
-            or (found := self._imu_lookup(camera, imu)) is None
-        ):
+        if self._imu_lookup is None or not imu or imu == camera or self._estimator.starts:
+            return
+        found = self._imu_lookup(camera, imu)
+        if found is None:
             return
         self._imu_lookup = None
         values, contradiction = extrinsics(self._settings.current, found, camera, imu)
@@ -262,15 +266,7 @@ class OdometryNode(StoppableNode):
             self._publish(self._estimator.newest_ns)
         for keyframe in self._estimator.take(most=1):
             self._keyframes.publish(self._message(keyframe))
-            self._path.append(
-                outgoing.pose_stamped_message(
-                    keyframe.stamp_ns,
-                    self._config.odometry_frame,
-                    keyframe.R,
-                    keyframe.position,
-                    message_class,
-                )
-            )
+            self._path.append(self._pose(keyframe))
             if self._config.odometry_rate == 0.0:
                 self._publish(keyframe.imu_ns)
         logs = self._info, self._warn, self._error
@@ -279,15 +275,18 @@ class OdometryNode(StoppableNode):
             level = 0 if notice.state is None else _LEVELS[notice.state]
             logs[level](notice.text)
 
-    def _message(self, odometry: Odometry) -> Any:
-        """nav_msgs/Odometry; its twist is in the axes of the child frame."""
-        pose = outgoing.pose_stamped_message(
+    def _pose(self, odometry: Odometry) -> Any:
+        return outgoing.pose_stamped_message(
             odometry.stamp_ns,
             self._config.odometry_frame,
             odometry.R,
             odometry.position,
             message_class,
         )
+
+    def _message(self, odometry: Odometry) -> Any:
+        """nav_msgs/Odometry; its twist is in the axes of the child frame."""
+        pose = self._pose(odometry)
         return message_class('nav_msgs/msg/Odometry')(
             header=pose.header,
             child_frame_id=odometry.frame_id,
@@ -358,20 +357,20 @@ class OdometryNode(StoppableNode):
     def _values(self) -> list[tuple[str, str]]:
         """The fields of /diagnostics."""
         estimator = self._estimator
-        values = [('state', estimator.state.value), ('reason', estimator.reason)]
+        values = {'state': estimator.state.value, 'reason': estimator.reason}
         for name in _COUNTS:
-            values.append((name.replace(' ', '_'), str(estimator.counts[name])))
+            values[name.replace(' ', '_')] = str(estimator.counts[name])
         position, position_sigma = estimator.imu_position
-        values.append(('imu_position', _numbers(position, '.3f')))
-        values.append(('imu_position_sigma', _numbers(position_sigma, '.3f')))
+        values['imu_position'] = _numbers(position, '.3f')
+        values['imu_position_sigma'] = _numbers(position_sigma, '.3f')
         for name, (deviation, sigma) in estimator.deviations.items():
-            values.append((f'{name}_deviation', _numbers(deviation, '.3g')))
-            values.append((f'{name}_deviation_sigma', _numbers(sigma, '.3g')))
+            values[f'{name}_deviation'] = _numbers(deviation, '.3g')
+            values[f'{name}_deviation_sigma'] = _numbers(sigma, '.3g')
         if estimator.starts:
             started = estimator.starts[-1]
-            values.append(('started', 'at rest' if started.at_rest else 'in motion'))
-            values.append(('start_scale_sigma', f'{started.scale_sigma:.3f}'))
-        return values
+            values['started'] = 'at rest' if started.at_rest else 'in motion'
+            values['start_scale_sigma'] = f'{started.scale_sigma:.3f}'
+        return list(values.items())
 
 
 def _numbers(values: Iterable[float], form: str) -> str:

@@ -16,7 +16,7 @@ from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.nodes.inputs import SHUT_DOWN
 
-# Prefix of the parameters by which rclpy overrides the QoS of a topic.
+# Prefix of the parameters by which rclpy overrides the QoS of a topic. [derived: rclpy]
 _QOS = 'qos_overrides.'
 
 
@@ -28,13 +28,14 @@ class NodeParameters:
     """
 
     def __init__(self, node: Node, on_change: Callable[[Parameters], None]) -> None:
-        self._node, self._on_change = node, on_change
-        values = {}
-        for name, default, declared in Parameters.declarations():
-            value = _declare(node, name, default, declared)
-            if value is not None:
-                values[name] = value
-        self.current = Parameters.from_mapping(values)
+        self._node = node
+        self._on_change = on_change
+        values = {
+            name: _declare(node, name, default, declared)
+            for name, default, declared in Parameters.declarations()
+        }
+        given = {name: value for name, value in values.items() if value is not None}
+        self.current = Parameters.from_mapping(given)
         # Those of the user, which a calibration does not replace.
         self._given = set(self.current.given())
         self._adopting = False

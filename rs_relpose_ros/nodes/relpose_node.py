@@ -20,7 +20,7 @@ from rs_relpose_ros.tracking.images import Pixels
 # Name of the node. [derived: interface]
 NAME = 'relpose_node'
 
-# What --help prints.
+# What --help prints. [derived: the topics and services below]
 _DESCRIPTION = (
     'Relative poses of a rolling-shutter camera, aided by an IMU.\n\n'
     'subscribes: image (or image/compressed with image_transport:=compressed), '
@@ -71,11 +71,8 @@ class RelposeNode(SensorNode):
     def _on_processed(self, frame: Frame[PairResult]) -> None:
         if frame.result is not None:
             config = self._settings.current.pair
-            self._outputs.publish(
-                frame.result,
-                config,
-                partial(self._statistics.add_pair, frame.result, frame.ready_ns),
-            )
+            count = partial(self._statistics.add_pair, frame.result, frame.ready_ns)
+            self._outputs.publish(frame.result, config, count)
             self._log_health(frame.result.health, withhold=config.withhold_when_wrong)
         if self._timings is not None:
             self._timings.add(frame)
@@ -127,14 +124,11 @@ class PairPublishers:
                 )
             )
         if config.publish_debug_image and self._debug_image.get_subscription_count():
-            self._debug_image.publish(
-                outgoing.image_message(
-                    result.stamp_ns,
-                    result.frame_id,
-                    Pixels(outgoing.draw_pair(result), 'bgr8'),
-                    message_class,
-                )
+            pixels = Pixels(outgoing.draw_pair(result), 'bgr8')
+            message = outgoing.image_message(
+                result.stamp_ns, result.frame_id, pixels, message_class
             )
+            self._debug_image.publish(message)
 
 
 main = partial(run_node, RelposeNode, NAME, _DESCRIPTION)

@@ -195,10 +195,8 @@ def _help(name: str, description: str) -> argparse.ArgumentParser:
     lines = ['parameters (set them with --ros-args -p NAME:=VALUE or --params-file FILE):']
     for parameter, default, declared in Parameters.declarations():
         shown = 'no default' if default is None else f'default {default!r}'
-        lines.append(
-            f'  {parameter}: {declared.description}. {declared.legal}; {shown}'
-            f'{"; live" if declared.live else ""}'
-        )
+        live = '; live' if declared.live else ''
+        lines.append(f'  {parameter}: {declared.description}. {declared.legal}; {shown}{live}')
     return argparse.ArgumentParser(
         prog=name,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -343,13 +341,9 @@ class SensorNode(StoppableNode):
 
     def _why_it_cannot_start(self) -> str:
         """The fault of parameters or topics; empty for none."""
-        parameters, idle = self._settings.current, self._frame_statistics.idle
-        missing = parameters.sensor.missing()
-        if (
-            missing
-            and parameters.calibration.calibrate_at_start == 'never'
-            and not self._waits_for_tf()
-        ):
+        idle = self._frame_statistics.idle
+        missing = self._settings.current.sensor.missing()
+        if missing and not self._may_calibrate() and not self._waits_for_tf():
             return (
                 f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
                 'calibrate_at_start: missing'
@@ -361,6 +355,9 @@ class SensorNode(StoppableNode):
                 'timestamp; remap image to the raw one'
             )
         return ''
+
+    def _may_calibrate(self) -> bool:
+        return self._settings.current.calibration.calibrate_at_start != 'never'
 
     def _waits_for_tf(self) -> bool:
         """Whether only the rotation is missing, and /tf_static may give it."""
@@ -386,27 +383,8 @@ class SensorNode(StoppableNode):
             self._error(self._cannot_start)
             return
         if calibrate or parameters.sensor.missing():
-            # Imported where it is needed: a start with a calibration is faster by it.
-            from rs_relpose_ros.calibrate.live import LiveCalibration
-
-            config, others = (
-                parameters.calibration,
-                ['the rotation of the IMU on /tf_static'] if self._waits_for_tf() else [],
-            )
-            if not self.calibrates:
-                others.append(
-                    'a calibration by relpose_node on ' + self.resolve_topic_name('calibration')
-                )
-            fits = self.calibrates and config.calibrate_at_start != 'never'
-            self._calibration = LiveCalibration(
-                parameters,
-                use_stored=not calibrate
-                and config.load_calibration
-                and config.calibrate_at_start != 'never',
-                waits_for='' if fits else ' or '.join(others),
-                topic=self.resolve_topic_name('image'),
-            )
-            self._calibration.quat_prior = self._quat_prior
+            may_load = parameters.calibration.load_calibration and self._may_calibrate()
+            self._calibration = self._make_calibration(use_stored=may_load and not calibrate)
             self._intake: Any = self._calibration
             self._progress = Progress('calibrating: waiting for images and gyro')
             self._worker = Worker(self._intake, self._warm_up, self._consume_calibration)
@@ -420,33 +398,50 @@ class SensorNode(StoppableNode):
         # No subscription before the kernels are loaded: the first frames would be dropped.
         self._warm_timer.reset()
 
+    def _make_calibration(self, *, use_stored: bool) -> LiveCalibration:
+        # Imported where it is needed: a start with a calibration is faster by it.
+        from rs_relpose_ros.calibrate.live import LiveCalibration
+
+        others = []
+        if self._waits_for_tf():
+            others.append('the rotation of the IMU on /tf_static')
+        if not self.calibrates:
+            topic = self.resolve_topic_name('calibration')
+            others.append(f'a calibration by relpose_node on {topic}')
+        fits = self.calibrates and self._may_calibrate()
+        calibration = LiveCalibration(
+            self._settings.current,
+            use_stored=use_stored,
+            waits_for='' if fits else ' or '.join(others),
+            topic=self.resolve_topic_name('image'),
+        )
+        calibration.quat_prior = self._quat_prior
+        return calibration
+
     def _subscribe_when_warm(self) -> None:
         assert self._worker is not None
         if not self._worker.warm.is_set():
             return
         self._warm_timer.cancel()
-        if self._inputs is not None:
+        if self._inputs is None:
+            self._inputs = self._subscribe()
+        else:
             self._inputs.hand_to(self._intake)
-            self._frame_statistics.start()
-            self._log_ready(self._inputs)
-            return
+        self._frame_statistics.start()
+        image, camera_info, imu, _ = self._inputs.topics.values()
+        state = 'ready' if self._calibration is None else 'waiting for the first image'
+        self.get_logger().info(f'{state}: {image}, {camera_info} and {imu}')
+
+    def _subscribe(self) -> SensorInputs:
         with ros_parameters.legal_qos():
-            inputs = SensorInputs(
-                self, self._intake, self._settings.current.pair.image_transport, self._error
-            )
+            transport = self._settings.current.pair.image_transport
+            inputs = SensorInputs(self, self._intake, transport, self._error)
         for warning in ros_parameters.unknown_qos_overrides(self):
             self._warn(warning)
         # Objects that exist by now are permanent: the garbage collector need not scan them.
         gc.collect()
         gc.freeze()
-        self._inputs = inputs
-        self._frame_statistics.start()
-        self._log_ready(inputs)
-
-    def _log_ready(self, inputs: SensorInputs) -> None:
-        image, camera_info, imu, _ = inputs.topics.values()
-        state = 'ready' if self._calibration is None else 'waiting for the first image'
-        self.get_logger().info(f'{state}: {image}, {camera_info} and {imu}')
+        return inputs
 
     def stop(self) -> bool:
         """End the worker; whether it ended. Called before `destroy_node`."""
@@ -490,7 +485,8 @@ class SensorNode(StoppableNode):
 
     def _use_calibration(self, found: Calibrated) -> None:
         """Store and publish a calibration, and estimate with it."""
-        self._calibrated, config = found, self._settings.current.calibration
+        self._calibrated = found
+        config = self._settings.current.calibration
         self._info(found.summary)
         path: Path | str = 'this calibration'
         try:
@@ -515,21 +511,21 @@ class SensorNode(StoppableNode):
         # Of one frame_id for both sensors the axes are not known.
         if self._lookup is None or not camera or not imu or camera == imu:
             return
-        found, parameters = self._lookup(camera, imu), self._settings.current
+        found = self._lookup(camera, imu)
+        calibration = self._calibration
         if found is None:
-            if self._calibration is not None and self._calibration.waits_for:
-                self._progress = Progress(
-                    f'waiting for {self._calibration.waits_for}: {self._lookup.problem}'
-                )
-                self._info(self._progress.text)
+            if calibration is not None and calibration.waits_for:
+                text = f'waiting for {calibration.waits_for}: {self._lookup.problem}'
+                self._progress = Progress(text)
+                self._info(text)
             return
         self._quat_prior = found[3:]
-        if self._calibration is not None:
-            self._calibration.quat_prior = self._quat_prior
+        if calibration is not None:
+            calibration.quat_prior = self._quat_prior
             if not self._waits_for_tf():
                 return
         self._lookup = None
-        values, contradiction = extrinsics(parameters, found, camera, imu)
+        values, contradiction = extrinsics(self._settings.current, found, camera, imu)
         if contradiction:
             self._warn(contradiction)
         if values:
@@ -539,9 +535,9 @@ class SensorNode(StoppableNode):
     def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Calibrate from here on; values that the user has given stay."""
         self._begin(calibrate=True)
-        response.success, response.message = (
-            not self._cannot_start,
-            (self._cannot_start or 'calibrating: rotate the camera about all three axes'),
+        response.success = not self._cannot_start
+        response.message = (
+            self._cannot_start or 'calibrating: rotate the camera about all three axes'
         )
         return response
 
@@ -616,12 +612,12 @@ class SensorNode(StoppableNode):
             self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
         self.warn_of_namesake()
-        warning = (
-            ''
-            if self._inputs is None
-            else diagnostics.stamps_warning(self._inputs.stamps_ns, self._inputs.image_bytes)
-        )
-        counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
+        inputs = self._inputs
+        warning = ''
+        counts: Counter[str] = Counter()
+        if inputs is not None:
+            warning = diagnostics.stamps_warning(inputs.stamps_ns, inputs.image_bytes)
+            counts = inputs.counts.copy()
         source = self._calibration if self._loop is None else self._loop.sequencer
         report = self._frame_statistics.report(
             counts,
@@ -634,12 +630,12 @@ class SensorNode(StoppableNode):
         self.publish_status(
             report.level, self.task, report.text, self._image_topic(), report.values
         )
-        if self._inputs is not None:
-            self._log_silence(self._inputs, report.silence, problem)
-            for role, frame_id in self._inputs.frame_ids.items():
+        if inputs is not None:
+            self._log_silence(inputs, report.silence, problem)
+            for role, frame_id in inputs.frame_ids.items():
                 if not frame_id:
                     self._warn(
-                        f'messages on {self._inputs.topics[role]} have no frame_id: no '
+                        f'messages on {inputs.topics[role]} have no frame_id: no '
                         'transform is found for them, and RViz shows no result; set it in '
                         'the driver'
                     )
@@ -678,19 +674,18 @@ class SensorNode(StoppableNode):
 
     def _image_topic(self) -> str:
         """The subscribed one, with its transport."""
-        return (
-            self.resolve_topic_name('image')
-            if self._inputs is None
-            else self._inputs.topics[Role.IMAGE]
-        )
+        if self._inputs is None:
+            return self.resolve_topic_name('image')
+        return self._inputs.topics[Role.IMAGE]
 
     def _problem(self) -> tuple[str, tuple[str, ...]]:
         """The current reason for no result, and the names of missing parameters or inputs."""
-        if self._cannot_start:
-            return self._cannot_start, tuple(self._settings.current.sensor.missing())
+        text = self._cannot_start
+        if not text and self._progress is not None:
+            text = self._progress.text
+        if text:
+            return text, tuple(self._settings.current.sensor.missing())
         assert self._worker is not None
-        if self._progress is not None:
-            return self._progress.text, tuple(self._settings.current.sensor.missing())
         if not self._worker.is_alive():
             return f'{self._frame_statistics.idle}: the worker ended, see the log', ()
         if self._inputs is None or not self._worker.warm.is_set():
@@ -701,18 +696,17 @@ class SensorNode(StoppableNode):
         """The missing input; logged, unless the driver is probably not running yet."""
         idle = self._frame_statistics.idle
         image, camera_info, imu, _ = inputs.topics.values()
-        missing = tuple(
-            topic
-            for role, topic in inputs.topics.items()
-            if role is not Role.ACCEL and inputs.silent(role)
-        )
+        needed = {role: topic for role, topic in inputs.topics.items() if role is not Role.ACCEL}
+        missing = tuple(topic for role, topic in needed.items() if inputs.silent(role))
         if self._intake.camera_info_problem:
             return f'{idle}: {self._intake.camera_info_problem}', ('calibration',)
         # Without any image the driver is probably not running: a status, but no log line.
         if image in missing:
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
-        configured = self._settings.current.intrinsics.given
-        if self._intake.intrinsics is None and camera_info in missing and not configured:
+        has_intrinsics = (
+            self._intake.intrinsics is not None or self._settings.current.intrinsics.given
+        )
+        if camera_info in missing and not has_intrinsics:
             text = (
                 f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
                 'topic of the driver, which must publish a calibration, or give '

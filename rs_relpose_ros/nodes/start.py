@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
 
-# Signals that end a node.
+# Signals that end a node. [derived: ros2 launch sends the first, systems the second]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _stop: Callable[[], object] | None = None  # ends the spinning of the node

@@ -51,8 +51,9 @@ def draw_errors(
     """Errors over time, with estimated sigmas; `baselines`: those of other methods, by name."""
     picture = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
-    known = [(r, r.errors) for r in records if r.pose and r.errors is not None]
-    begins, ends = _spans([r for r, _ in known], start_ns)
+    known = [record for record in records if record.pose and record.errors is not None]
+    begins, ends = _spans(known, start_ns)
+    middles = 0.5 * (begins + ends)
     # Root of the mean square length of a 3-vector and a 2-vector with these sigmas.
     series = (
         ('rotation_error', rotation_sigmas, 'rotation error [deg]'),
@@ -60,19 +61,21 @@ def draw_errors(
     )
     for axis, (name, sigmas_of, label) in zip(picture.axes, series, strict=True):
         if known:
-            values = [getattr(e, name) for _, e in known]
-            sigmas = [np.degrees(np.linalg.norm(sigmas_of(r.pose.covariance))) for r, _ in known]
+            values = [getattr(record.errors, name) for record in known]
+            lengths = [np.linalg.norm(sigmas_of(record.pose.covariance)) for record in known]
+            sigmas = np.degrees(lengths)
             axis.hlines(
                 sigmas, begins, ends, color=ORANGE, linewidth=2.2, label='1 sigma, as estimated'
             )
-            axis.plot(0.5 * (begins + ends), values, 'o', color=BLUE, markersize=5, label='error')
+            axis.plot(middles, values, 'o', color=BLUE, markersize=5, label='error')
             _median_line(axis, values, f'median error {np.median(values):.2g} deg')
-            for (method, errors), color, marker in zip(
+            others_drawn = zip(
                 (baselines or {}).items(), cycle((RED, GREEN)), cycle('+x12'), strict=False
-            ):
-                others = [np.nan if e is None else getattr(e, name) for e in errors]
+            )
+            for (method, errors), color, marker in others_drawn:
+                others = [np.nan if one is None else getattr(one, name) for one in errors]
                 axis.plot(
-                    0.5 * (begins + ends),
+                    middles,
                     others,
                     marker,
                     color=color,
@@ -91,23 +94,21 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     """Metrics without ground truth: residuals, inliers, rotation against the gyro."""
     picture = _over_time(3, 'residuals of the relative poses')
     start_ns = records[0].reference_ns1
-    known = [r.metrics for r in records if r.pose]
-    begins, ends = _spans([r for r in records if r.pose], start_ns)
+    known = [record for record in records if record.pose]
+    begins, ends = _spans(known, start_ns)
     series = (
-        ([f['residual_rms_px'] for f in known], 'residual of inliers,\nrms [px]'),
-        ([100.0 * f['inlier_ratio'] for f in known], 'inliers [%]'),
-        (
-            [f['rotation_difference_to_gyro_deg'] for f in known],
-            'rotation: images\nagainst gyro [deg]',
-        ),
+        ('residual_rms_px', 1.0, None, 'residual of inliers,\nrms [px]'),
+        ('inlier_ratio', 100.0, 105.0, 'inliers [%]'),
+        ('rotation_difference_to_gyro_deg', 1.0, None, 'rotation: images\nagainst gyro [deg]'),
     )
-    for axis, (values, label) in zip(picture.axes, series, strict=True):
+    for axis, (metric, factor, top, label) in zip(picture.axes, series, strict=True):
+        values = [factor * record.metrics[metric] for record in known]
         finite = [value for value in values if np.isfinite(value)]
         if finite:
             axis.plot(0.5 * (begins + ends), values, 'o', color=BLUE, markersize=4)
             _median_line(axis, finite, f'median {np.median(finite):.3g}')
         axis.set_ylabel(label)
-        axis.set_ylim(bottom=0.0, top=None if '%' not in label else 105.0)
+        axis.set_ylim(bottom=0.0, top=top)
         _shade_no_pose(axis, records, start_ns)
     _save_over_time(picture, path)
 
@@ -124,10 +125,10 @@ def draw_rotation(
         2, 'orientation against the first keyframe: the rotations of the pairs, chained'
     )
     above, below = picture.axes
-    estimated, reference = _vectors(chains['estimated']), _vectors(chains[against])
-    for column, (color, name) in enumerate(
-        ((BLUE, 'x (right)'), (RED, 'y (down)'), (GREEN, 'z (forward)'))
-    ):
+    estimated = _vectors(chains['estimated'])
+    reference = _vectors(chains[against])
+    components = ((BLUE, 'x (right)'), (RED, 'y (down)'), (GREEN, 'z (forward)'))
+    for column, (color, name) in enumerate(components):
         above.plot(times, estimated[:, column], 'o-', color=color, label=name, markersize=3)
         label = against if column == 2 else None
         above.plot(times, reference[:, column], '--', color='black', linewidth=1.0, label=label)
@@ -153,14 +154,19 @@ def _chains(records: Sequence[PairRecord], truth: TrueTrajectory | None) -> dict
     A pair without a rotation is bridged by the gyro.
     """
     unknown = np.full((3, 3), np.nan)
-    gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
-    pairs = zip(records, gyro, strict=True)
-    estimated = [g if np.isnan(r.pose.R).any() else r.pose.R for r, g in pairs]
+    estimated = []
+    gyro = []
+    true = []
+    for record in records:
+        by_gyro = unknown if record.gyro_rotation is None else record.gyro_rotation
+        gyro.append(by_gyro)
+        estimated.append(by_gyro if np.isnan(record.pose.R).any() else record.pose.R)
+        if truth is not None:
+            pose = truth.relative_pose(record.reference_ns1, record.reference_ns2)
+            true.append(unknown if pose is None else pose[0])
     chains = {'estimated': _accumulated(estimated), 'gyro alone': _accumulated(gyro)}
     if truth is not None:
-        poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
-        rotations = [unknown if pose is None else pose[0] for pose in poses]
-        chains['ground truth'] = _accumulated(rotations)
+        chains['ground truth'] = _accumulated(true)
     return chains
 
 

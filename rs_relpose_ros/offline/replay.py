@@ -38,7 +38,9 @@ from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, O
 from rs_relpose_ros.pipeline.sequencer import FrameRefused
 from rs_relpose_ros.pipeline.warm_up import warm_up
 
+# Folder of the bag of a replay with one. [derived: interface]
 BAG_FOLDER = 'relpose_bag'
+# Pictures of a replay in the order of `draw_replay`. [derived: interface]
 PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
 
 _logger = logging.getLogger(__name__)
@@ -161,10 +163,9 @@ class Replay:
                     '%d of the %d chosen stamps are not in the bag', absent, len(self._stamps)
                 )
         most = next(iter(self.reasons.most_common()), None)
-        if most is not None and (
-            not self.sequencer.counts().frames_taken
-            or (self.failed_frames and not self.pair_count)
-        ):
+        nothing_taken = not self.sequencer.counts().frames_taken
+        all_failed = self.failed_frames and not self.pair_count
+        if most is not None and (nothing_taken or all_failed):
             raise InputError(f'no frame of {self._bag.path} could be used: {most}')
 
     @property
@@ -348,9 +349,10 @@ def read_stamps(path: Path | str) -> frozenset[int]:
     return stamps
 
 
-# Columns of the list, those of the tables of `replay`: these are valid lists.
+# Columns of the list. The tables of `replay` have the same, so that they are valid lists.
+# [derived: interface]
 LIST_COLUMNS = POSES.columns[:2]
-# The table of `replay`, and the reason of a pair without a pose.
+# The table of `replay`, with the reason of a pair without a pose. [derived: interface]
 CHOSEN_POSES = tables.Table(
     POSES.file,
     (*POSES.columns, 'reason'),
@@ -363,9 +365,8 @@ def read_pairs(path: Path) -> list[Stamps]:
     with check_file(path).open(newline='', encoding='utf-8-sig', errors='replace') as file:
         rows = csv.DictReader(file)
         places = (Row(path, rows.line_num, row) for row in rows)
-        pairs = [
-            (row.nanoseconds(LIST_COLUMNS[0]), row.nanoseconds(LIST_COLUMNS[1])) for row in places
-        ]
+        first, second = LIST_COLUMNS
+        pairs = [(row.nanoseconds(first), row.nanoseconds(second)) for row in places]
     if not pairs:
         raise InputError(
             f'{path} has no pairs below a line with the column names {" and ".join(LIST_COLUMNS)}'
@@ -422,9 +423,8 @@ def related(
 
     def reason(first: int, second: int) -> str:
         if first >= second:
-            return f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: ' + (
-                'give two different images' if first == second else 'exchange them'
-            )
+            remedy = 'give two different images' if first == second else 'exchange them'
+            return f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: {remedy}'
         for stamp in (first, second):
             if stamp not in intake.stamps_found:
                 return f'no image on {topics.image.name} has the stamp {stamp}'
@@ -432,6 +432,5 @@ def related(
                 return f'the image of {stamp} cannot be used: {problems[stamp]}'
         return 'the clock of the images jumped back between the two'
 
-    return [
-        results[pair] if pair in results else reason(*pair) for pair in pairs
-    ], intake.intrinsics
+    found = [results[pair] if pair in results else reason(*pair) for pair in pairs]
+    return found, intake.intrinsics

@@ -62,12 +62,14 @@ def _pose_row(record: PairRecord) -> list[str]:
 
     Floats are written so that they read back bit-equal.
     """
-    pose, matches = record.pose, number(record.metrics.get('matches', math.nan))
+    pose = record.pose
+    matches = number(record.metrics.get('matches', math.nan))
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
     if not pose.rotation_known:
         return [*stamps, *[''] * 13, matches, '', pose.status.value, '', '']
     # As published: of the pose, or of the rotation alone.
-    covariance, known = np.full((6, 6), math.nan), slice(0 if pose else 3, 6)
+    covariance = np.full((6, 6), math.nan)
+    known = slice(0 if pose else 3, 6)
     published = published_covariance(pose.covariance[known, known])
     covariance[known, known] = published.reshape(covariance[known, known].shape)
     values = [
@@ -88,7 +90,7 @@ def _pose_row(record: PairRecord) -> list[str]:
     ]
 
 
-# relative_poses.csv: a row for each pair.
+# relative_poses.csv has a row for each pair. [derived: interface]
 POSES = Table(
     'relative_poses.csv',
     (
@@ -122,20 +124,10 @@ def _error_row(record: PairRecord) -> list[str] | None:
     if not record.metrics:
         return None
     errors = record.errors
-    # PURE_ROTATION has a rotation, but is no pose.
-    values = (
-        [''] * 4
-        if errors is None
-        else [
-            number(value)
-            for value in (
-                errors.baseline,
-                errors.rotation,
-                errors.rotation_error,
-                errors.translation_error,
-            )
-        ]
-    )
+    values = [''] * 4
+    if errors is not None:
+        known = errors.baseline, errors.rotation, errors.rotation_error, errors.translation_error
+        values = [number(value) for value in known]
     return [
         str(record.reference_stamp_ns),
         str(record.stamp_ns),
@@ -145,7 +137,7 @@ def _error_row(record: PairRecord) -> list[str] | None:
     ]
 
 
-# errors.csv: a row for each pair with a true pose.
+# errors.csv has a row for each pair with a true pose. [derived: interface]
 ERRORS = Table(
     'errors.csv',
     (
@@ -221,13 +213,16 @@ def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | Non
     errors = [record.errors for record in answered if record.errors is not None]
     if not errors:
         return None
-    metrics: dict[str, Any] = {'pairs': len(errors)}
-    for name in ('rotation', 'translation'):
-        values = [getattr(error, f'{name}_error') for error in errors]
-        metrics[f'{name}_median_deg'], metrics[f'{name}_p90_deg'] = map(
-            _finite, median_and_p90(values)
-        )
-    return {**metrics, 'baseline_median_m': median([error.baseline for error in errors])}
+    rotation, rotation_p90 = median_and_p90([error.rotation_error for error in errors])
+    translation, translation_p90 = median_and_p90([error.translation_error for error in errors])
+    return {
+        'pairs': len(errors),
+        'rotation_median_deg': _finite(rotation),
+        'rotation_p90_deg': _finite(rotation_p90),
+        'translation_median_deg': _finite(translation),
+        'translation_p90_deg': _finite(translation_p90),
+        'baseline_median_m': median([error.baseline for error in errors]),
+    }
 
 
 def median(values: Sequence[float]) -> float | None:

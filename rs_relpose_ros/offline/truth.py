@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,9 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
-# Largest interval of two poses for an interpolation.
+# Largest interval of two poses for an interpolation [ns]. Over a longer one the motion between the
+# poses is unknown; a shorter one would leave pairs without errors. [chosen: poses of 10 Hz, one of
+# which is lost]
 _MAX_GAP_NS = to_nanoseconds(0.2)
 # Fewest poses of a ground truth: fewer are no trajectory to compare with. [chosen: any value in
 # 2..10 would do]
@@ -51,46 +54,48 @@ class TrueTrajectory:
                 f'least {_MIN_POSES} are needed'
             )
         norms = np.linalg.norm(quats.clip(-2.0, 2.0), axis=1)  # squares of damaged ones overflow
-        if not (
-            bool(np.all(np.abs(positions) <= _FARTHEST))  # false for NaN
-            and np.isfinite(quats).all()
-            and (np.abs(norms - 1.0) < 1e-2).all()
-        ):
+        is_near = np.abs(positions) <= _FARTHEST  # False for NaN, as is_unit
+        is_unit = np.abs(norms - 1.0) < 1e-2
+        if not (is_near.all() and is_unit.all()):
             raise InputError(
                 'the ground truth has a pose that is not finite or beyond the moon, or whose '
                 'quaternion has not the length 1'
             )
         self._stamps = stamps[order]
-        # Seconds since the first pose: absolute stamps do not fit into a float.
-        seconds = (self._stamps - self._stamps[0]) / NANOSECONDS
+        seconds = self._seconds(self._stamps)
         self._position = CubicSpline(seconds, positions)
         self._rotation = Slerp(seconds, Rotation.from_quat(quats))
 
+    def _seconds(self, at_ns: ArrayLike) -> Array:
+        """Seconds since the first pose: absolute stamps do not fit into a float."""
+        return np.asarray((np.asarray(at_ns, dtype=np.int64) - self._stamps[0]) / NANOSECONDS)
+
     def covers(self, at_ns: int) -> bool:
         """Whether there are poses close enough before and after a time."""
-        after = int(np.searchsorted(self._stamps, at_ns))
-        return after < len(self._stamps) and bool(
-            self._stamps[after] == at_ns
-            or (after > 0 and self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
-        )
+        stamps = self._stamps
+        after = int(np.searchsorted(stamps, at_ns))
+        if after == len(stamps):
+            return False
+        has_near_ones = after > 0 and stamps[after] - stamps[after - 1] <= _MAX_GAP_NS
+        return bool(has_near_ones or stamps[after] == at_ns)
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""
-        return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS))
+        return np.asarray(self._position(self._seconds(at_ns)))
 
     def velocity(self, at_ns: int) -> Array:
-        """Velocity (3,) [m/s] in the world, likewise."""
-        return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS, 1))
+        """Velocity (3,) [m/s] in the world at a time that the poses cover."""
+        return np.asarray(self._position(self._seconds(at_ns), 1))
 
     def rotation(self, at_ns: int) -> Array:
-        """R (3, 3) from the camera to the world, likewise."""
-        return np.asarray(self._rotation((at_ns - self._stamps[0]) / NANOSECONDS).as_matrix())
+        """R (3, 3) from the camera to the world at a time that the poses cover."""
+        return np.asarray(self._rotation(self._seconds(at_ns)).as_matrix())
 
     def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) [m] with ``X1 = R X2 + t``; None outside of the ground truth."""
         if not (self.covers(ns1) and self.covers(ns2)):
             return None
-        seconds = (np.array([ns1, ns2], dtype=np.int64) - self._stamps[0]) / NANOSECONDS
+        seconds = self._seconds([ns1, ns2])
         R1, R2 = self._rotation(seconds).as_matrix()
         p1, p2 = self._position(seconds)
         return R1.T @ R2, R1.T @ (p2 - p1)
@@ -101,23 +106,23 @@ class TrueTrajectory:
         if truth is None:
             return None
         R_true, t_true = truth
+        between_directions = math.nan
+        if t_true.any():
+            # The arc cosine loses digits at small angles.
+            sine = np.linalg.norm(np.cross(t, t_true))
+            between_directions = math.degrees(np.arctan2(sine, t @ t_true))
         return PairErrors(
             baseline=float(np.linalg.norm(t_true)),
             rotation=rotation_angle(R_true),
             rotation_error=rotation_angle(R.T @ R_true),
-            # The arc cosine loses digits at small angles.
-            translation_error=float(
-                np.degrees(np.arctan2(np.linalg.norm(np.cross(t, t_true)), t @ t_true))
-            )
-            if t_true.any()
-            else np.nan,
+            translation_error=between_directions,
         )
 
 
 def rotation_angle(R: Array) -> float:
     """Angle of a rotation matrix [deg]; NaN for NaN."""
     if not np.isfinite(R).all():
-        return float('nan')
+        return math.nan
     return float(np.degrees(Rotation.from_matrix(R).magnitude()))
 
 
@@ -126,5 +131,5 @@ def median_and_p90(values: Sequence[float]) -> tuple[float, float]:
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if not len(finite):
-        return float('nan'), float('nan')
+        return math.nan, math.nan
     return float(np.median(finite)), float(np.percentile(finite, 90))

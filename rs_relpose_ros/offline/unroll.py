@@ -10,7 +10,14 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import (
+    Intake,
+    PARTS,
+    ReasonCounts,
+    Role,
+    SENSOR_ROLES,
+    stamp_ns,
+)
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reason
 from rs_relpose_ros.output_files import beside
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
@@ -73,7 +80,7 @@ class Unrolling:
         """Messages of camera and IMU; all but images and CameraInfo are copied."""
         roles = {
             (topic.name, topic.msgtype): role
-            for role in (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
+            for role in SENSOR_ROLES
             if (topic := getattr(self._topics, role.value)) is not None
         }
         for raw in self._bag.raw_messages(topics, by_stamp=True):
@@ -83,15 +90,14 @@ class Unrolling:
                 self._writer.copy(raw)
             if role is None:
                 if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
-                    self._shared.setdefault(raw.topic, []).append(
-                        stamp_ns(self._bag.read(raw).header) in self._times
-                    )
+                    stamp = stamp_ns(self._bag.read(raw).header)
+                    self._shared.setdefault(raw.topic, []).append(stamp in self._times)
                 continue
             message = self._bag.read(raw)
             if role is Role.IMAGE:
                 self.images_in_bag += 1
                 try:
-                    stamp: int = PARTS[role].read(message).stamp_ns
+                    stamp = PARTS[role].read(message).stamp_ns
                 except RsRelposeError as error:
                     self.reasons.add(str(error))
                     continue
@@ -100,18 +106,21 @@ class Unrolling:
 
     def _write(self, result: GlobalShutterFrame, bag_time_ns: int) -> None:
         """Write an image with its CameraInfo."""
-        topic, info, types = self._topics.image, self._topics.camera_info, self._writer.type
-        header, pixels = (result.stamp_ns, result.frame_id), result.image()
-        image = (
-            outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
-            if topic.msgtype == reader.COMPRESSED_IMAGE
-            else outgoing.image_message(*header, pixels, types)
-        )
-        camera_info = outgoing.camera_info_message(
-            *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types
-        )
-        name = topic.camera_info if info is None else info.name
-        self._writer.write(name, reader.CAMERA_INFO, camera_info, bag_time_ns)
+        topic = self._topics.image
+        types = self._writer.type
+        origin = result.stamp_ns, result.frame_id
+        pixels = result.image()
+        if topic.msgtype == reader.COMPRESSED_IMAGE:
+            image = outgoing.compressed_image_message(
+                *origin, pixels, png=result.is_png, types=types
+            )
+        else:
+            image = outgoing.image_message(*origin, pixels, types)
+        published = self._intake.camera_info_of(result.intrinsics)
+        info = outgoing.camera_info_message(*origin, result.intrinsics, published, types)
+        info_topic = self._topics.camera_info
+        name = topic.camera_info if info_topic is None else info_topic.name
+        self._writer.write(name, reader.CAMERA_INFO, info, bag_time_ns)
         self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)
         self.images += 1
         self.largest_shift = max(self.largest_shift, result.map.shift)

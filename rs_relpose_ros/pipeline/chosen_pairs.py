@@ -8,7 +8,7 @@ are close to each other the interval constrains the velocities, and the frames b
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model, TrackingConfig
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -142,6 +142,12 @@ def _since(
 
 # Stamps of the earlier and of the later image of a pair [ns].
 Stamps = tuple[int, int]
+Kept = TypeVar('Kept')
+
+
+def _after(first_ns: int, by_stamp: dict[int, Kept]) -> dict[int, Kept]:
+    """The entries with a stamp later than the first one."""
+    return {stamp_ns: one for stamp_ns, one in by_stamp.items() if stamp_ns > first_ns}
 
 
 class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
@@ -153,10 +159,10 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
 
     def __init__(self, wanted: Collection[Stamps]) -> None:
         self._wanted = frozenset(wanted)
-        self._last: dict[int, int] = {}
-        for first_ns, second_ns in self._wanted:
-            self._last[first_ns] = max(second_ns, self._last.get(first_ns, second_ns))
-        self._frames: dict[int, Frame[Any]] = {}  # by stamp
+        # Stamp of the last frame that each first frame is related to.
+        self._last = dict(sorted(self._wanted))
+        # All by the stamp of the frame.
+        self._frames: dict[int, Frame[Any]] = {}
         self._recent: dict[int, Frame[Any]] = {}
         self._imus: dict[int, FrameImu] = {}
 
@@ -178,25 +184,17 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
             if (first_ns, current_ns) in self._wanted
         }
         self._frames[current_ns] = frame
+        self._recent[current_ns] = frame
+        last = self._last
         self._frames = {
             stamp_ns: one
             for stamp_ns, one in self._frames.items()
-            if self._last.get(stamp_ns, 0) > current_ns
+            if last.get(stamp_ns, 0) > current_ns
         }
-        oldest_ns = min(self._frames, default=current_ns)
         longest_ns = to_nanoseconds(parameters.keyframes.max_keyframe_interval)
-        first_ns = min(
-            (stamp_ns for stamp_ns in self._frames if stamp_ns > current_ns - longest_ns),
-            default=current_ns,
-        )
-        self._recent = {
-            stamp_ns: one
-            for stamp_ns, one in (*self._recent.items(), (current_ns, frame))
-            if stamp_ns > first_ns
-        }
-        self._imus = {
-            stamp_ns: one for stamp_ns, one in self._imus.items() if stamp_ns > oldest_ns
-        }
+        near = [stamp_ns for stamp_ns in self._frames if stamp_ns > current_ns - longest_ns]
+        self._recent = _after(min(near, default=current_ns), self._recent)
+        self._imus = _after(min(self._frames, default=current_ns), self._imus)
         return pairs or None
 
     def _pair(

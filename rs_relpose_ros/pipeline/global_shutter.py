@@ -21,7 +21,7 @@ from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.geometry import timing
+from rs_relpose_ros.geometry import Array, timing
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
@@ -43,7 +43,7 @@ _BAND = 64
 # Orientations over the readout; linear in between. Less bends the image, more costs time.
 # [measured: to 1e-7 rad at 3 rad/s]
 _ORIENTATIONS = 129
-# Pose of a frame by itself, for the consistency monitor.
+# Pose of a frame by itself, which the consistency monitor wants. [derived: there is no pair]
 _NO_POSE = RelativePose(Status.TOO_FEW_MATCHES, 'no pair')
 
 
@@ -60,15 +60,10 @@ class RowMap(NamedTuple):
         for top in range(0, self.height, _BAND):
             bottom = min(top + _BAND, self.height)
             nodes = self.nodes[top // _STEP : math.ceil(bottom / _STEP) + 2]
-            band = cv2.resize(
-                nodes,
-                (nodes.shape[1] * _STEP, nodes.shape[0] * _STEP),
-                interpolation=cv2.INTER_LINEAR,
-            )
-            yield (
-                slice(top, bottom),
-                np.asarray(band[_STEP : _STEP + bottom - top, _STEP : _STEP + self.width]),
-            )
+            size = nodes.shape[1] * _STEP, nodes.shape[0] * _STEP
+            band = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
+            sources = band[_STEP : _STEP + bottom - top, _STEP : _STEP + self.width]
+            yield slice(top, bottom), np.asarray(sources)
 
 
 class MiddleRow:
@@ -78,20 +73,15 @@ class MiddleRow:
         self.sensor = sensor
         camera = sensor.camera
         intrinsics = sensor.intrinsics
-        sizes = intrinsics.image_height, intrinsics.image_width
-        # cv2.resize puts node k at pixel (k + 1/2) step - 1/2; one node more on each side, so that
-        # all pixels lie between nodes.
-        down, across = (
-            (np.arange(math.ceil(size / _STEP) + 2) - 0.5) * _STEP - 0.5 for size in sizes
-        )
+        down = _node_pixels(intrinsics.image_height)
+        across = _node_pixels(intrinsics.image_width)
         self._shape = len(down), len(across)
         self._nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
         pixels = intrinsics.to_sensor(self._nodes)
         self._rays = camera.unproject(pixels)
         self._rows = np.ascontiguousarray(camera.rows_of(pixels))  # of the sensor
-        height, width = sizes
-        middle = intrinsics.to_sensor([0.5 * (width - 1), 0.5 * (height - 1)])
-        self.delay = float(camera.pixel_times(middle))
+        centre = 0.5 * (intrinsics.image_width - 1), 0.5 * (intrinsics.image_height - 1)
+        self.delay = float(camera.pixel_times(intrinsics.to_sensor(centre)))
 
     def map(self, motion: FrameMotion) -> RowMap:
         """Where the pixels come from, for a motion relative to the reference row of the camera."""
@@ -114,7 +104,17 @@ class MiddleRow:
         )
 
 
-# OpenCV's name of each border.
+def _node_pixels(size: int) -> Array:
+    """Pixels (N,) of the nodes along a side of the image.
+
+    cv2.resize puts node k at pixel (k + 1/2) step - 1/2. There is one node more on each side, so
+    that all pixels lie between nodes.
+    """
+    nodes = np.arange(math.ceil(size / _STEP) + 2, dtype=np.float64)
+    return (nodes - 0.5) * _STEP - 0.5
+
+
+# OpenCV's name of each border. [derived: OpenCV]
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 
@@ -304,12 +304,9 @@ class RotationWatch(Processor[None]):
         # Not predicted by the gyro, which may be wrong.
         matches = self._tracker.track(frame.image)
         camera = sensor_model(frame.intrinsics, parameters.sensor).camera
-        by_images = rotation_of_rays(
-            *(
-                camera.unproject(frame.intrinsics.to_sensor(points))
-                for points in (matches.points1, matches.points2)
-            )
-        )
+        rays1 = camera.unproject(frame.intrinsics.to_sensor(matches.points1))
+        rays2 = camera.unproject(frame.intrinsics.to_sensor(matches.points2))
+        by_images = rotation_of_rays(rays1, rays2)
         if by_images is not None:
             self._monitor.rotations.add(
                 frame.stamp_ns,

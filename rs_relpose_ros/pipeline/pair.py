@@ -63,7 +63,7 @@ class Frame(Generic[Result]):
     encoded: EncodedImage | None = None
     restart: bool = False  # time jumped since the frame before: tracks belong to another time
     # On the monotonic clock, 0 offline: arrival of the image or of the IMU sample behind its last
-    # row, the later of the two; begin of the decoding.
+    # row, whichever was later; and the begin of the decoding.
     ready_ns: int = 0
     taken_ns: int = 0
     seconds: float = 0.0  # wall time of the processing
@@ -104,8 +104,17 @@ def is_keyframe(
 ) -> bool:
     """Whether the current frame creates a keyframe pair: enough parallax, or time is up.
 
-    Since the reference keyframe: median parallax of the matches after derotation [px], interval
-    [s], number of frames, and share of the keyframe's features that are still tracked.
+    Parameters
+    ----------
+    config : KeyframeConfig
+    parallax : float
+        Median parallax of the matches with the reference keyframe, after derotation [px].
+    interval : float
+        Time since the reference keyframe [s].
+    frames : int
+        Number of frames since the reference keyframe.
+    tracked_fraction : float
+        Share of the features of the reference keyframe that are still tracked.
     """
     return (
         parallax >= config.min_keyframe_parallax
@@ -119,11 +128,12 @@ def is_keyframe(
 class PairResult:
     """Estimate of one keyframe pair with its matches."""
 
-    # Of the reference keyframe's and the current image's pose rows, on the camera's clock: their
-    # header stamps, or those of their middle rows (`pose_row`).
+    # Times of the rows of reference keyframe and current image that the pose relates: their header
+    # stamps, or the stamps of their middle rows (`pose_row`), on the clock of the camera.
     reference_stamp_ns: int
     stamp_ns: int
-    reference_ns1: int  # the same times on the IMU clock
+    # The same times on the clock of the IMU.
+    reference_ns1: int
     reference_ns2: int
     frame_id: str  # of the current image
     interval: float  # [s] between the two reference times
@@ -135,7 +145,8 @@ class PairResult:
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
     health: Assessment = NOT_EVALUATED  # by the pairs before: published before its assessment
-    tracked: Tracked | None = None  # this and applied: as after this pair
+    # Tracked calibration, and the corrections that follow from it, after this pair.
+    tracked: Tracked | None = None
     applied: Applied = field(default_factory=Applied)
     gyro_bias: Array | None = None  # (3,) [rad/s] that was removed, IMU frame
     image2: NDArray[np.uint8] | None = None  # only if the front end keeps images
@@ -172,7 +183,7 @@ class PairMetric(NamedTuple):
         return '' if math.isnan(value) else f'{value:.{self.digits}f}'
 
 
-# The one list for topics, /diagnostics and files.
+# Metrics of a pair, for topics, /diagnostics and files alike. [derived: interface]
 PAIR_METRICS = (
     PairMetric('matches', lambda pair: len(pair.matches), 0),
     PairMetric('inliers', lambda pair: pair.inliers, 0),
@@ -288,7 +299,7 @@ _LARGEST_GRAVITY_SIGMA = 1.5
 # accuracy; with three, the largest errors of long pairs were a quarter larger on recordings.
 # [measured: recordings, together with the removal of observations far from a first result]
 MOST_FRAMES = 5
-# Statuses of pairs whose images may be dark.
+# Statuses of pairs whose images may be dark. [derived: both come of too few good matches]
 _LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
 
 
@@ -468,7 +479,7 @@ class TrackHistory:
         )
 
 
-# Of a frame whose rotation the gyro does not give.
+# Rotation of a frame where the gyro does not give it. [derived: NaN is not known]
 _UNKNOWN = np.full((3, 3), math.nan)
 
 

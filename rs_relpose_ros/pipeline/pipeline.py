@@ -44,7 +44,7 @@ _ROTATION_FRAMES = 3
 # Least time between two published pairs with too few matches [s]: in the dark each frame creates
 # one. [chosen: two a second are enough for a display]
 _UNMATCHED_PERIOD = 0.5
-# Reason for a pair without the accelerometer.
+# Reason for a pair without the accelerometer. [derived: text for people]
 _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
 
@@ -60,7 +60,7 @@ class _RotationStart:
 
 
 class Processor(Generic[Result]):
-    """Works on frames in the order of their stamps, in one thread."""
+    """Makes a result of each frame, in the order of their stamps and in one thread."""
 
     applied = Applied()  # tracked corrections for the next frame
 
@@ -84,8 +84,8 @@ class Pipeline(Processor[PairResult]):
     """Tracks frames against a reference keyframe and estimates the pose of each keyframe pair.
 
     Parameters that may change while running (declared `live`) are not kept: `process` gets the
-    current ones with each frame. With `keep_images` results contain the current image. `tracker`:
-    instead of that of the parameters.
+    current ones with each frame. With `keep_images` results contain the current image. `tracker`
+    replaces the tracker of the parameters.
     """
 
     def __init__(
@@ -111,7 +111,8 @@ class Pipeline(Processor[PairResult]):
         self._stamps_ns.clear()
         self._history: TrackHistory | None = None  # since the reference
         self._previous: Frame[Any] | None = None
-        # The last derotated matches; of the reference: None until there are any.
+        # The last derotated matches. They have the rays of the reference, and of the previous
+        # image; each is None where these rays are not known.
         self._of_reference: Matches | None = None
         self._of_previous: Matches | None = None
         self._rotation: _RotationStart | None = None
@@ -185,7 +186,7 @@ class Pipeline(Processor[PairResult]):
         masked = still.static.any()
         imu_of_new = still.imu_of_new(stamp_ns, image, imu, previous, sensor)
         if still.static.any() and not masked:
-            # What was found with the static part in view is no evidence.
+            # Measurements with the static part in view are no evidence of anything.
             self._monitor = ConsistencyMonitor()
         self._monitor.image_findings = still.findings()
         self._tracker.allow(still.allowed())
@@ -320,7 +321,7 @@ class Pipeline(Processor[PairResult]):
             stamp_sigma=stamp_sigma(self._stamps_ns),
         )
         pose = self._estimated(problem, frame.stamp_ns)
-        # A contradiction shows what is wrong.
+        # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None

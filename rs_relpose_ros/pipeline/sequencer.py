@@ -37,7 +37,8 @@ _FAR_NS = 10 * NANOSECONDS
 # indicate a clock that was set back by less than that: messages out of order come alone.
 # [chosen: a tenth of a second at 30 Hz]
 _BACK_FRAMES = 3
-# The same of samples of the IMU. [chosen: a tenth of a second at 200 Hz]
+# Number of consecutive samples of the IMU that indicate the same. [chosen: a tenth of a second at
+# 200 Hz]
 _BACK_SAMPLES = 20
 # Most frames that wait for the worker: they bound the latency of a worker that is too slow. With
 # less, a single slow pair loses frames. [chosen: a sixth of a second at 30 Hz]
@@ -52,7 +53,7 @@ _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
 # Most refusals that are kept until they are taken; the counters lose none.
 # [chosen: some seconds of frames]
 _REFUSALS_KEPT = 256
-# Refused with this reason where the gyro has a gap.
+# Reason of a refusal where the gyro has a gap. [derived: text for people]
 _IMU_GAP = 'the gyro does not cover the readout of the frame: it has a gap there, or begins later'
 # An exposure is longer than the interval between frames beyond this ratio of the two: stamps
 # jitter. [chosen: a quarter of the interval for both stamps of a phone]
@@ -113,7 +114,10 @@ class QueuedFrame:
 
 
 class _StampOrder:
-    """Recognises single wild stamps, and runs of `patience` that a clock set back produces."""
+    """Recognises wild stamps, which come alone, and a clock that was set back.
+
+    A clock that was set back produces at least `patience` stamps behind the newest one.
+    """
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
@@ -122,7 +126,10 @@ class _StampOrder:
         self._wild_ns: int | None = None  # the last one, unless the clock jumped to it
 
     def is_wild(self, stamp_ns: int, last_ns: int | None) -> bool:
-        """Whether a stamp is far from the last one (zero), and no other came before it there."""
+        """Whether a stamp is far from the last one, and the stamp before it was not there, too.
+
+        Drivers send a stamp of zero, for example.
+        """
         if last_ns is None or abs(stamp_ns - last_ns) <= _FAR_NS:
             self._wild_ns = None
             return False
@@ -131,7 +138,10 @@ class _StampOrder:
         return not confirmed
 
     def is_set_back(self, stamp_ns: int, newest_ns: int | None) -> bool:
-        """Whether a stamp ends a run behind the newest one, each newer than the one before."""
+        """Whether this stamp completes a run of stamps behind the newest one.
+
+        Each stamp of a run is newer than the one before it.
+        """
         if newest_ns is None or stamp_ns >= newest_ns:
             self._count = 0
             return False
@@ -171,7 +181,7 @@ class Sequencer:
         self._changed = threading.Condition()
         self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
-        # Of samples without and with a gyro, and of frames.
+        # The first is for samples without a gyro, the second for those with one.
         self._sample_orders = _StampOrder(math.inf), _StampOrder(_BACK_SAMPLES)
         self._frame_order = _StampOrder(_BACK_FRAMES)
         self._queue: deque[QueuedFrame] = deque()
@@ -179,7 +189,7 @@ class Sequencer:
         self._last_stamp_ns: int | None = None
         self._intervals = timing.FrameIntervals()
         self._previous_ns: int | None = None  # reference time of the frame taken before
-        # Tracked corrections.
+        # Tracked corrections: of the time offset, and a margin around a frame [ns].
         self._offset_ns = self._margin_ns = 0
         # Number of jumps in time: when frames came, and as they are taken.
         self._generation = 0
@@ -213,7 +223,7 @@ class Sequencer:
             counts.imu_samples += 1
             counts.imu_repeated += not added
             if has_gyro and last_ns is not None:
-                # Of two topics one is always behind; late is a gyro sample behind another one.
+                # Of two topics one is always behind: only gyro samples are compared.
                 counts.imu_late += added and stamp_ns < last_ns
                 counts.imu_gaps += stamp_ns - last_ns > self._max_gap_ns
             if self._queue:
@@ -228,7 +238,7 @@ class Sequencer:
             if not self._accepts(stamp_ns, clock.exposed_span_ns(stamp_ns)[1]):
                 return
             self._last_stamp_ns = stamp_ns
-            # Of all frames that come, also of those refused later: live as in replay.
+            # Frames that are refused later count, too, so that live and replay agree.
             interval_ns = self._intervals.add(stamp_ns)
             exposure_ns = clock.exposure_time * NANOSECONDS
             if interval_ns and exposure_ns > _LONGEST_EXPOSURE * interval_ns:
@@ -453,7 +463,10 @@ class Sequencer:
     # -- refusals and jumps of a clock -------------------------------------------------------
 
     def _accepts(self, stamp_ns: int, end_ns: int) -> bool:
-        """Whether a frame of this stamp is added; else it is refused. Time may restart with it."""
+        """Whether a frame of this stamp may be added; if not, it is refused here.
+
+        `end_ns` is the time of its last row. Time restarts with a frame whose clock jumped.
+        """
         last_ns = self._last_stamp_ns
         if last_ns is not None and self._frame_order.is_wild(stamp_ns, last_ns):
             self._refuse(
@@ -492,7 +505,7 @@ class Sequencer:
         self._changed.notify()
 
     def _drop(self, queued: QueuedFrame, refusal: Refusal, reason: str) -> None:
-        """Refuse a frame of the queue; one without IMU data perhaps for clocks that differ."""
+        """Refuse a queued frame. If it has no IMU data, check whether the two clocks differ."""
         self._queue.remove(queued)
         apart = timing.clocks_apart(queued.ahead)
         if apart and refusal in (Refusal.NO_IMU, Refusal.IMU_GAP):
@@ -514,7 +527,7 @@ class Sequencer:
 # Frames over which the scatter is estimated: less is noise, more follows a change too late.
 # [chosen: a second at 30 Hz]
 SCATTER_FRAMES = 32
-# Intervals below this quantile of all contain no lost frame.
+# The interval at this quantile of all contains no lost frame.
 # [derived: less than three of four intervals are lost or doubled]
 _WHOLE = 0.25
 # A larger scatter, as a share of the interval, is a camera without a rhythm.
@@ -531,12 +544,14 @@ def stamp_sigma(stamps_ns: Sequence[int]) -> float:
     mean magnitude and not their variance.
     """
     intervals = np.diff(np.array(stamps_ns)) / NANOSECONDS
-    if len(intervals) < 2:
+    count = len(intervals)
+    if count < 2:
         return 0.0
-    period = float(np.sort(intervals)[int(_WHOLE * (len(intervals) - 1))])
+    period = float(np.sort(intervals)[int(_WHOLE * (count - 1))])
     if not period > 0.0:
         return 0.0
-    changes = np.diff(intervals - np.round(intervals / period) * period)
+    corrected = intervals - np.round(intervals / period) * period
+    changes = np.abs(np.diff(corrected))
     # Mean magnitude of a normal variable: sqrt(2 / pi) sigma.
-    sigma = float(np.sqrt(np.pi / 2.0) * np.abs(changes).mean() / np.sqrt(6.0))
+    sigma = float(np.sqrt(np.pi / 2.0) * changes.mean() / np.sqrt(6.0))
     return min(sigma, _LARGEST_SHARE * period)

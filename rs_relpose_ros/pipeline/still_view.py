@@ -24,9 +24,11 @@ from rs_relpose_ros.tracking.still import (
     StillParts,
 )
 
-# Number of images of which the repeated ones are counted, and number of repeated ones that are
-# reported. One or two repeated images are no habit of a driver. [chosen: 20 s at 30 Hz; 3 to 10]
+# Number of the last images among which repeated ones are counted. More would report a driver that
+# has stopped repeating. [chosen: 20 s at 30 Hz]
 _COUNTED = 600
+# Least number of repeated images that is reported: one or two are no habit of a driver.
+# [chosen: 3 to 10 would do]
 _REPORTED = 3
 
 
@@ -84,13 +86,18 @@ class StillView:
     def _extent(self) -> dict[str, Any]:
         """Share of the image that is static, and the rows and columns [px] that contain it."""
         height, width = self._size
-        rows = np.flatnonzero(self.static.any(axis=1))
-        columns = np.flatnonzero(self.static.any(axis=0))
         return {
             'share': float(self.static.mean()),
-            'rows': [round(height * k / ROWS) for k in (rows[0], rows[-1] + 1)],
-            'columns': [round(width * k / COLUMNS) for k in (columns[0], columns[-1] + 1)],
+            'rows': _range(np.any(self.static, axis=1), height),
+            'columns': _range(np.any(self.static, axis=0), width),
         }
+
+
+def _range(are_static: Flags, size: int) -> list[int]:
+    """First and last pixel of the flagged cells, which divide `size` pixels evenly."""
+    cells = np.flatnonzero(are_static)
+    first, last = cells[0], cells[-1] + 1
+    return [round(size * cell / len(are_static)) for cell in (first, last)]
 
 
 def _still(code: Code, measured: dict[str, Any]) -> Finding:

@@ -40,12 +40,13 @@ from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.solvers.common import Solutions
 from rs_relpose_ros.tracking.images import RawImage
 
-# Size of the made-up images [px]: small, as their content does not matter, but large enough to be
+# Width of the made-up images [px]: small, as their content does not matter, but large enough to be
 # searched at half size, as most images are. [chosen: any size above 240 would do]
 _WIDTH = 320
-# [chosen: the same]
+# Height of the made-up images [px]. [chosen: the same]
 _HEIGHT = 240
-# With distortion, so that its kernels are compiled, too.
+# The made-up camera. It has a distortion, whose kernels are then compiled, too. [chosen: any
+# distortion would do]
 _INTRINSICS = Intrinsics(
     width=_WIDTH,
     height=_HEIGHT,
@@ -58,14 +59,15 @@ _INTRINSICS = Intrinsics(
     distortion_model='plumb_bob',
     distortion=(-0.02, 0.01, 0.0, 0.0),
 )
-# What would keep made-up frames from being processed is replaced by these.
+# These values replace parameters that would keep made-up frames from being processed. [chosen: any
+# legal values would do]
 MADE_UP_SENSOR = {
     'readout_time': 0.02,
     'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0],
     'time_offset': 0.0,
     'stamp_exposure': 'middle',
 }
-# Rotation of a made-up pair by the gyro, with its covariance.
+# Rotation of a made-up pair by the gyro, with its covariance. [chosen: any values would do]
 _ROTATION = np.eye(3), 1e-4 * np.eye(3)
 
 
@@ -106,15 +108,13 @@ def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator
 def _images() -> Iterator[NDArray[np.uint8]]:
     """A far wall behind a near one, from a camera that moves and then stops."""
     noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
+    layers = [cv2.GaussianBlur(layer, (0, 0), 2.0) for layer in noise]
     far, near = (
-        cv2.normalize(
-            cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255, cv2.NORM_MINMAX
-        )
-        for layer in noise
+        cv2.normalize(layer, np.empty_like(layer), 0, 255, cv2.NORM_MINMAX) for layer in layers
     )
     for shift in (0, 4, 8, 8):
         image = np.roll(far, -shift, axis=1)
-        image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
+        image[80:160] = np.roll(near[80:160], -3 * shift, axis=1)
         yield image
 
 
@@ -144,7 +144,8 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     )
     motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
     world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
-    return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
+    later = world - [0.5, 0.0, 0.0]
+    return camera.project(world), camera.project(later), camera, motion
 
 
 # -- The cache of the kernels: other processes fill it, so that their memory is freed -------------
@@ -152,12 +153,14 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
 # Garbage collections of Python while kernels compile: their syntax trees are no garbage, so that
 # looking for some costs a tenth of the time. [measured: compilation of all kernels]
 _GC_THRESHOLD = 100_000
-# More inliers than any pair has matches: a pipeline with it does everything but the estimate.
+# A pipeline with this least number of inliers does everything but the estimate. [chosen: no pair
+# has so many matches]
 _UNREACHABLE = 10_000
-# Arguments of this module for processes that another one has started: they compile all kernels,
-# or those of the two-view estimate alone.
+# Argument of this module in a process that another one has started to compile all kernels.
+# [chosen: any word would do]
 _WHOLE = 'whole'
-# See above.
+# Argument in a process that compiles the kernels of the two-view estimate alone. [chosen: any
+# other word would do]
 _HALF = 'half'
 
 
