@@ -150,7 +150,8 @@ def _metadata_of(information: Any) -> Metadata:
         digests[str(described['name']), str(described['type'])] = digest
     parts = {}
     for part in information.get('files') or ():
-        start, duration = part['starting_time'], part['duration']
+        start = part['starting_time']
+        duration = part['duration']
         parts[PurePath(str(part['path'])).name] = (
             start['nanoseconds_since_epoch'] / NANOSECONDS,
             duration['nanoseconds'] / NANOSECONDS,

@@ -90,7 +90,8 @@ class McapStorage:
             if kind == _CHUNK:
                 chunk = memoryview(self._chunks[start])
                 for inner, offset, length in _records_of(chunk):
-                    yield from self._entry(inner, chunk[offset : offset + length], start, offset)
+                    record = chunk[offset : offset + length]
+                    yield from self._entry(inner, record, start, offset)
             elif kind in (_SCHEMA, _CHANNEL, _MESSAGE):
                 yield from self._entry(kind, self._read(start, size), start, -1)
 
@@ -123,10 +124,12 @@ class McapStorage:
     def _find_end(self) -> tuple[int, int]:
         """Places of the footer and of the summary; the latter is 0 if there is none."""
         magic = Source.MCAP.value
-        footer = max(os.fstat(self._file.fileno()).st_size - _END.size, len(magic))
-        kind, size, summary, _, _, last_bytes = _END.unpack(self._read(footer, _END.size))
-        content = _END.size - _HEAD.size - len(magic)
-        if (kind, size, last_bytes) != (_FOOTER, content, magic) or summary > footer:
+        file_size = os.fstat(self._file.fileno()).st_size
+        footer = max(file_size - _END.size, len(magic))
+        end = self._read(footer, _END.size)
+        kind, size, summary, _, _, last_bytes = _END.unpack(end)
+        expected = _FOOTER, _END.size - _HEAD.size - len(magic), magic
+        if (kind, size, last_bytes) != expected or summary > footer:
             raise DamagedError('it has no end')
         return footer, summary
 
@@ -154,7 +157,8 @@ class McapStorage:
             self._counts[entry.topic_id] += 1
             first = entry.time_ns if first is None else min(first, entry.time_ns)
             last = entry.time_ns if last is None else max(last, entry.time_ns)
-        self.start_ns, self.end_ns = first or 0, last or 0
+        self.start_ns = first or 0
+        self.end_ns = last or 0
 
     def _describe(self, kind: int, record: bytes) -> None:
         """Keep a schema or a channel."""

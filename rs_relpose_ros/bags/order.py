@@ -1,4 +1,4 @@
-"""The order in which the messages of a bag are read offline: that of their header stamps.
+"""The order in which the messages of a bag are read offline: by their header stamps.
 
 Receive times say when a message reached the recorder: some seconds late over a wireless link, or,
 in a converted bag, hours after its measurement and topic after topic. Sensors are compared by the

@@ -112,7 +112,7 @@ class _TopicFinder:
 
     bag: Path
     topics: Sequence[Topic]
-    names: Mapping[str, str]  # those chosen, by role
+    names: Mapping[str, str]  # of the topics that the user has chosen, by role
     first_message: Callable[[Topic], Any]  # None where it cannot be read
     complete: bool = True  # whether an absent topic is an error
 
@@ -145,9 +145,10 @@ class _TopicFinder:
         preferred: str = '',
         without: Topic | None = None,
     ) -> Topic | None:
-        """The chosen topic, or that of a name, or the only one of these types.
+        """The topic that the user has chosen, or the `preferred` one, or the only one of a type.
 
-        `fix` if there is none, `hint` if there are several; the ground truth may be absent.
+        An error has the text `fix` if there is none, and `hint` if there are several. The ground
+        truth may be absent.
         """
         if chosen := self._chosen(role, *msgtypes):
             return chosen
@@ -168,7 +169,8 @@ class _TopicFinder:
         return candidates[0]
 
     def _chosen(self, role: str, *msgtypes: str) -> Topic | None:
-        name, option = self.names.get(role, ''), option_of(role)
+        name = self.names.get(role, '')
+        option = option_of(role)
         if not name:
             return None
         found = [topic for topic in self.topics if topic.name.lstrip('/') == name.lstrip('/')]
@@ -361,9 +363,10 @@ class Bag:
     ) -> SensorTopics:
         """The sensors' topics: as chosen, or by type if that is unambiguous.
 
-        `names`: those chosen, by field of `SensorTopics`; empty ones are as if absent. Of several
-        CameraInfo topics, that next to the image is used, and of two Imu topics one with 'gyro'
-        and one with 'accel' in its name make a pair (RealSense).
+        `names` are the topics that the user has chosen, by field of `SensorTopics`; an empty name
+        means that the user has not chosen. Of several CameraInfo topics, the one next to the image
+        is used. Of two Imu topics, one with 'gyro' and one with 'accel' in its name make a pair
+        (RealSense).
         """
         finder = _TopicFinder(self.path, self.topics, names or {}, self._first_message)
         found = finder.find(needs_camera_info)
@@ -372,7 +375,7 @@ class Bag:
         return SensorTopics(found.image, found.camera_info, found.imu, found.accel, truth)
 
     def choose_topics(self, names: Mapping[str, str]) -> Chosen:
-        """The same, but None for those that are absent; a rectified image is chosen, too."""
+        """The sensors' topics, None where one is absent; a rectified image is chosen, too."""
         finder = _TopicFinder(self.path, self.topics, names, self._first_message, complete=False)
         return finder.find(False)
 
@@ -399,14 +402,17 @@ class Bag:
         times = self._by_stamp(index) if by_stamp else index.received
         stored = list(self._stored.values())
         # Equal times are read in the order of the topics' names, whatever the file has first.
-        by_name = np.argsort(np.argsort([topic.name for topic in stored]))
-        for row in np.lexsort((by_name[index.topic], times)):
+        names = [topic.name for topic in stored]
+        rank = np.argsort(np.argsort(names))
+        for row in np.lexsort((rank[index.topic], times)):
             topic = stored[index.topic[row]]
-            place, offset = int(index.place[row]), int(index.offset[row])
-            data = self._as_cdr(topic, self._data(int(index.file[row]), place, offset))
+            file = int(index.file[row])
+            data = self._data(file, int(index.place[row]), int(index.offset[row]))
+            cdr = self._as_cdr(topic, data)
             self.on_message(topic.name)
-            received_ns, read_ns = int(index.received[row]), int(times[row])
-            yield RawMessage(topic.name, topic.msgtype, received_ns, data, read_ns)
+            received_ns = int(index.received[row])
+            read_ns = int(times[row])
+            yield RawMessage(topic.name, topic.msgtype, received_ns, cdr, read_ns)
 
     def timeline(self, topic: Topic) -> Timeline:
         """Stamps and times of reception of a topic."""

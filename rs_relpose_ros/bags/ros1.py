@@ -45,7 +45,7 @@ _PLACE = struct.Struct('<Q')
 _TIME = struct.Struct('<II')
 # Connection and the number of its messages in a chunk. [derived: the format]
 _COUNT = struct.Struct('<II')
-# Bytes of the largest header of a record that is read. [chosen: that of a connection holds a
+# Bytes of the largest header of a record that is read. [chosen: the header of a connection holds a
 # topic's name, the others less than 100 bytes]
 _MAX_HEADER = 1 << 16
 # Duration without an end in profiles of QoS. [derived: rosbag2]
@@ -131,17 +131,19 @@ class Ros1Storage:
         while start < end:
             fields, data, size = self._record(start)
             start = data + size
-            if fields['op'][0] == _CONNECTION:
+            kind = fields['op'][0]
+            if kind == _CONNECTION:
                 (number,) = _LENGTH.unpack(fields['conn'])
-                # Both parts name the topic: that of the record counts, the other may be remapped.
+                # Header and data both name the topic. The header has it as it was recorded.
                 connections[number] = {**_fields(self._read(data, size)), 'topic': fields['topic']}
-            elif fields['op'][0] == _CHUNK_INFO:
-                self._places.append(_PLACE.unpack(fields['chunk_pos'])[0])
+            elif kind == _CHUNK_INFO:
+                self._places += _PLACE.unpack(fields['chunk_pos'])
                 for connection, count in _COUNT.iter_unpack(self._read(data, size)):
                     self._counts[connection] += count
                 times += [_nanoseconds(fields['start_time']), _nanoseconds(fields['end_time'])]
         self._places.sort()
-        self.start_ns, self.end_ns = (min(times), max(times)) if times else (0, 0)
+        self.start_ns = min(times, default=0)
+        self.end_ns = max(times, default=0)
         self.topics = [self._topic(*connection) for connection in connections.items()]
 
     def _topic(self, number: int, connection: dict[str, bytes]) -> StoredTopic:
@@ -169,16 +171,19 @@ def _record_of(chunk: bytes, start: int) -> tuple[dict[str, bytes], int, int]:
     """Fields of the header of a record in a chunk, and start and end of its data."""
     (length,) = _LENGTH.unpack_from(chunk, start)
     header = start + _LENGTH.size
-    data = header + length + _LENGTH.size
-    (size,) = _LENGTH.unpack_from(chunk, data - _LENGTH.size)
-    if data + size > len(chunk):
+    end_of_header = header + length
+    (size,) = _LENGTH.unpack_from(chunk, end_of_header)
+    data = end_of_header + _LENGTH.size
+    end = data + size
+    if end > len(chunk):
         raise DamagedError('a record ends beyond its chunk')
-    return _fields(chunk[header : header + length]), data, data + size
+    return _fields(chunk[header:end_of_header]), data, end
 
 
 def _fields(header: bytes) -> dict[str, bytes]:
     """Names and values of a header."""
-    fields, start = {}, 0
+    fields = {}
+    start = 0
     while start < len(header):
         (length,) = _LENGTH.unpack_from(header, start)
         start += _LENGTH.size

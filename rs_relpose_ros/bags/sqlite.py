@@ -1,4 +1,4 @@
-"""Read the SQLite files of rosbag2, also those of a recorder that was killed."""
+"""Read the SQLite files of rosbag2, also after a recorder was killed."""
 
 from collections.abc import Iterator
 from contextlib import closing, ExitStack

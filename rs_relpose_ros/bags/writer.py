@@ -70,7 +70,7 @@ class BagWriter:
         )
 
     def announce(self, topic: Topic, origin: dict[str, Any]) -> None:
-        """Announce a topic whose messages are copied or replaced; `origin` is that of `Bag`."""
+        """Announce a topic whose messages are copied or replaced, with its `Bag.origin`."""
         described = {**origin, 'rihs01': origin.get('rihs01') or _UNKNOWN_HASH}
         if topic.msgtype in self._typestore.fielddefs and not origin['msgdef']:
             # rosbags writes the definition and the hash of a type that it knows.

@@ -140,7 +140,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command over all bags; 1 unless all of them are done."""
-    command, version = args.batch_command, package_version()
+    command = args.batch_command
+    version = package_version()
     if args.workers is not None and args.workers < 1:
         raise InputError(f'--workers must be at least 1, got {args.workers}')
     options, parameters = _options(args)
@@ -293,10 +294,13 @@ def run_job(job: Job) -> tuple[Row, Files]:
     """Do on a worker the work of `rs_relpose COMMAND`."""
     cv2.setNumThreads(1)
     started = time.perf_counter()
-    state, message, metrics = REFUSED, '', {}
+    state = REFUSED
+    message = ''
+    metrics = {}
     with TemporaryDirectory() as scratch:
         out = Path(scratch, 'out')
-        words, files = [job.command, job.bag.path], {}
+        words = [job.command, job.bag.path]
+        files = {}
         if job.bag.parameters:
             parameters = Path(scratch, 'parameters.yaml')
             parameters.write_text(job.bag.parameters, encoding='utf-8')
@@ -304,7 +308,8 @@ def run_job(job: Job) -> tuple[Row, Files]:
         if job.command != 'check':
             words += ['--out', str(out)]
         words += job.options
-        arguments, sys.argv = sys.argv, ['rs_relpose', *words]  # for summary.json
+        arguments = sys.argv
+        sys.argv = ['rs_relpose', *words]  # for summary.json
         try:
             with redirect_stderr(io.StringIO()):
                 results = _WORK[job.command](make_parser(job.command).parse_args(words))
@@ -317,7 +322,8 @@ def run_job(job: Job) -> tuple[Row, Files]:
         except RsRelposeError as error:
             message = str(error)
         except OSError as error:
-            state, message = FAILED, str(error)
+            state = FAILED
+            message = str(error)
         finally:
             sys.argv = arguments
         written_files = [file for file in sorted(out.rglob('*')) if file.is_file()]
@@ -435,7 +441,8 @@ def _problems(command: str, results: Mapping[str, Any]) -> str:
 @contextmanager
 def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """A client of a running scheduler, or of `workers` local processes of one thread each."""
-    dask, distributed = library('dask', _ABSENT), library('distributed', _ABSENT)
+    dask = library('dask', _ABSENT)
+    distributed = library('distributed', _ABSENT)
     # It logs starts and ends of processes; errors of the work are in the rows.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     with ExitStack() as stack:
@@ -498,7 +505,8 @@ def run_jobs(
 
     fill()
     for future in finished:
-        job, files = running.pop(future), Files()
+        job = running.pop(future)
+        files = Files()
         try:
             rows[job], files = future.result()
         except distributed.scheduler.KilledWorker:
@@ -662,7 +670,8 @@ def combine(rows: Sequence[Row]) -> dict[str, Any]:
     The metrics ``rotation_x_rad``, y and z are rotation vectors from the combined rotation
     ``v_cam = R(q) v_imu``, about the camera's axes.
     """
-    combined, quaternion = [], None
+    combined = []
+    quaternion = None
     for metric in (*_CALIBRATED, 'rotation'):
         column = metric.replace('.', '_')
         good = [row for row in rows if row[f'{column}_observable']]
@@ -722,7 +731,8 @@ def draw(
     for axes, (column, factor, label) in zip(both, _DRAWN[command], strict=True):
         outliers: Sequence[str] = ()
         if column in means:
-            mean, sigma = means[column]['mean'], means[column]['sigma']
+            mean = means[column]['mean']
+            sigma = means[column]['sigma']
             outliers = means[column]['outliers']
             axes.axvline(factor * mean, color=BLUE, linewidth=1.0)
             axes.axvspan(factor * (mean - sigma), factor * (mean + sigma), color=BLUE, alpha=0.2)

@@ -88,12 +88,16 @@ def _part_of_sensor(msg: Any, cx: float, cy: float, warn: Warn) -> dict[str, int
     The principal point (cx, cy) [px] shows whether the camera matrix is that of the sensor, as
     CameraInfo defines it, or already that of the image.
     """
-    width, height = int(msg.width), int(msg.height)
+    width = int(msg.width)
+    height = int(msg.height)
     # 0 in these fields means "not set": no binning, and the full sensor.
-    binning_x, binning_y = max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)
+    binning_x = max(int(msg.binning_x), 1)
+    binning_y = max(int(msg.binning_y), 1)
     roi = msg.roi
-    x_offset, y_offset = int(roi.x_offset), int(roi.y_offset)
-    roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
+    x_offset = int(roi.x_offset)
+    y_offset = int(roi.y_offset)
+    roi_width = int(roi.width) or width
+    roi_height = int(roi.height) or height
     whole = (roi_width, roi_height) == (width, height)
     of_sensor = _is_central(cx, width) and _is_central(cy, height)
     binned = width // binning_x, height // binning_y

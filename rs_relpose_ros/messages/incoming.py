@@ -221,7 +221,8 @@ def sensor_messages(
         if role is not Role.TRUTH
     }
     for message in bag.messages([topic for _, topic in found.values()], by_stamp=True):
-        role, content = found[message.topic][0], message.message
+        role = found[message.topic][0]
+        content = message.message
         if role is not Role.TRUTH and (role is not Role.IMU or has_gyro(content)):
             streams[message.topic].add(content.header)
         yield role, message
@@ -254,7 +255,8 @@ _LEAST_CLIPPING = 0.2
 
 def repeats(previous: images.EncodedImage, image: images.EncodedImage) -> bool:
     """Whether an image is bit-equal to the one before, which no message delivered twice is."""
-    first, second = previous.data, image.data
+    first = previous.data
+    second = image.data
     return (
         previous.stamp_ns != image.stamp_ns
         and len(first) == len(second)
@@ -284,14 +286,16 @@ class StuckGyro:
             return False
         for axis, value in enumerate(rate):
             self._add(axis, value, sample.stamp_ns)
-        count, since_ns = min(self._counts), max(self._since_ns)
+        count = min(self._counts)
+        since_ns = max(self._since_ns)
         fault = (
             'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
             'for a simulation without noise)'
         )
         clipped = self._clipped_axis(rate) if count == 1 else None
         if clipped is not None:
-            count, since_ns = self._counts[clipped], self._since_ns[clipped]
+            count = self._counts[clipped]
+            since_ns = self._since_ns[clipped]
             fault = (
                 f'the {"xyz"[clipped]} axis of the gyro repeats {rate[clipped]:.4g} rad/s bit by '
                 'bit: it is saturated'
@@ -403,7 +407,8 @@ class Intake:
 
     def _use(self, intrinsics: Intrinsics | None, problem: str = '') -> None:
         """Use these intrinsics from the images on that wait."""
-        self.intrinsics, self.camera_info_problem = intrinsics, problem
+        self.intrinsics = intrinsics
+        self.camera_info_problem = problem
         while self._held:
             self._add_frame(self._held.pop(0))
 
@@ -422,7 +427,8 @@ class Intake:
     def _add_frame(self, image: images.EncodedImage) -> None:
         if self._configured is not None:
             try:
-                size, last = image.size, self.intrinsics
+                size = image.size
+                last = self.intrinsics
                 if last is None or size != (last.image_width, last.image_height):
                     self.intrinsics = self._configured.of_image(*size)
             except InputError as error:
@@ -433,7 +439,8 @@ class Intake:
             self._sequencer.refuse(image.stamp_ns, Refusal.NO_CALIBRATION, problem)
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
-        before, self._last = self._last, image
+        before = self._last
+        self._last = image
         if before is not None and repeats(before, image):
             problem = (
                 'the image repeats the one before bit by bit: the camera or its driver is stuck, '
@@ -468,7 +475,8 @@ class ReasonCounts:
         """Count a message; whether it is the first one of its reason."""
         key = reason_key(text)
         if key not in self._counts and len(self._counts) >= MOST_REASONS:
-            key, text = '', 'further reasons of other kinds'
+            key = ''
+            text = 'further reasons of other kinds'
         first, count = self._counts.get(key, (text, 0))
         self._counts[key] = first, count + 1
         return count == 0

@@ -186,7 +186,7 @@ PAIR_VALUES = {
             'baseline_log_sigma',
         ),
         PairValue('baseline_reason', 'text', lambda pair: pair.pose.diagnostics.baseline_reason),
-        # Of the current camera in its own frame.
+        # The velocity of the current camera, in its own frame.
         PairValue(
             'linear_velocity_m_s',
             'vector',
@@ -230,7 +230,8 @@ def pair_parts(
     message stands for a missing value. `reference_frame`: frame_id of relative pose and rotation;
     empty for ``<camera frame>_reference``.
     """
-    pose, stamp_ns = result.pose, result.stamp_ns
+    pose = result.pose
+    stamp_ns = result.stamp_ns
     in_camera = header(stamp_ns, result.frame_id, types)
     in_reference = header(stamp_ns, reference_frame or f'{result.frame_id}_reference', types)
     # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
@@ -249,7 +250,7 @@ def pair_parts(
             time_ref=_time(result.reference_stamp_ns, types),
             source='reference_keyframe',
         )
-        # Of the current camera: angular in rad/s, linear in baselines per second.
+        # The velocities of the current camera: angular in rad/s, linear in baselines per second.
         parts['velocity'] = lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
             header=in_camera,
             twist=twist_message(
@@ -259,7 +260,7 @@ def pair_parts(
         parts['matches'] = lambda: _matches_message(inlier_records(result), in_reference, types)
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
-        # ``~/relative_pose``; the rates are those of ``~/velocity``.
+        # ``~/relative_pose``; ``~/velocity`` has the same rates.
         parts['relative_rotation'] = lambda: imu_message(
             stamp_ns,
             in_reference.frame_id,
@@ -478,7 +479,7 @@ def encoded_image_message(
     types: MessageTypes,
     image_format: str = 'mono8; jpeg compressed ',
 ) -> Any:
-    """sensor_msgs/CompressedImage of JPEG or PNG data; `image_format` as of image_transport."""
+    """sensor_msgs/CompressedImage of JPEG or PNG data; image_transport has the same formats."""
     message_type = types('sensor_msgs/msg/CompressedImage')
     return message_type(
         header=header(stamp_ns, frame_id, types),
@@ -494,7 +495,7 @@ def camera_info_message(
     published: Any,
     types: MessageTypes,
 ) -> Any:
-    """sensor_msgs/CameraInfo: that of `published` (ROS 1 or 2), or of the full sensor for None."""
+    """sensor_msgs/CameraInfo: a copy of `published` (ROS 1 or 2); the full sensor for None."""
     if published is None:
         model = camera.distortion_model
         binning = (0, 0)
@@ -612,7 +613,7 @@ _MAX_WIDTH = 960
 _BAR_WIDTH = 14
 # Height of the line of text below the image [px]. [derived: the font with a margin]
 _CAPTION_HEIGHT = 24
-# Colour of outliers: cyan does not occur among those of the rows. [chosen: for its contrast]
+# Colour of outliers: cyan does not occur among the colours of the rows. [chosen: for its contrast]
 _OUTLIER = (255, 255, 0)
 # Colour of all text. [chosen: for its contrast to the darkened image]
 _WHITE = (255, 255, 255)
@@ -662,10 +663,12 @@ def _draw_matches(
 
     `shares` (N,): rows of the points in the current image, as shares of all rows.
     """
-    colors = _COLORS[(shares * len(_COLORS)).astype(int)].tolist()
+    indices = shares * len(_COLORS)
+    colors = _COLORS[indices.astype(int)].tolist()
     points = np.stack([matches.points1, matches.points2], axis=1)
     scaled = (points + 0.5) * scale - 0.5  # pixel centres lie at integer coordinates
-    ends = np.round(scaled * (1 << _SHIFT)).astype(int).tolist()
+    fixed_point = np.round(scaled * (1 << _SHIFT))
+    ends = fixed_point.astype(int).tolist()
     for (start, end), inlier, color in zip(ends, inliers, colors, strict=True):
         drawn = color if inlier else _OUTLIER
         cv2.line(canvas, start, end, drawn, 1, cv2.LINE_AA, _SHIFT)
@@ -688,10 +691,11 @@ def _draw_row_times(canvas: Color, matches: Matches, axis: int, row_count: int) 
         canvas[:_BAR_WIDTH] = cv2.resize(_COLORS[None], (width, _BAR_WIDTH))
         places = (4, _BAR_WIDTH + 14), (max(width - 64, 4), _BAR_WIDTH + 14)
     line = np.polyfit(rows, matches.row_times[1], 1)
-    first, last = np.polyval(line, (0, row_count - 1))
-    for time, place in zip((first, last), places, strict=True):
+    first_and_last = np.polyval(line, (0, row_count - 1))
+    for time, place in zip(first_and_last, places, strict=True):
         # Adding zero makes a negative zero positive.
-        _write(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', place)
+        rounded = round(1e3 * time, 1) + 0.0
+        _write(canvas, f'{rounded:.1f} ms', place)
 
 
 def _caption(result: PairResult, inliers: int) -> str:

@@ -59,8 +59,8 @@ class PublishedPair:
 
     Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
     ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
-    are the inliers as of `outgoing.inlier_records`. Unknown values are NaN; there are no matches
-    without a pose. The fields from `has_pose` on are those of the other topics than ``~/pairs``.
+    are the inliers, as `outgoing.inlier_records` makes them. Unknown values are NaN; there are no
+    matches without a pose. The fields from `has_pose` on come from other topics than ``~/pairs``.
     """
 
     reference_stamp_ns: int  # header stamp of the reference keyframe
@@ -68,13 +68,13 @@ class PublishedPair:
     frame_id: str
     reference_imu_ns: int  # times of the two stamped rows on the IMU's clock
     current_imu_ns: int
-    status: str  # as of `Status`
+    status: str  # a value of `Status`
     reason: str  # of a pair without a pose; else empty
     baseline: float  # [m]
     baseline_log_sigma: float  # 1 sigma of its logarithm
     gyro_bias: Array  # (3,) [rad/s] that was removed, in the axes of the IMU
     images: ImageInformation | None  # estimate of the images alone
-    health: str  # consistency of the calibration, as of `FindingState`
+    health: str  # consistency of the calibration, a value of `FindingState`
     findings: Assessment  # the findings on the calibration
     has_pose: bool = False
     R: Array = field(default_factory=lambda: np.full((3, 3), math.nan))  # (3, 3)
@@ -157,7 +157,7 @@ class PairStatus:
         return self._texts[key]
 
     def findings(self) -> Assessment:
-        """The findings on the calibration; InputError if they are not those of its state."""
+        """The findings on the calibration; InputError if they contradict its state."""
         health: Assessment = self['findings']
         if self['health'] != health.state.value:
             raise InputError(
@@ -172,8 +172,10 @@ class PairStatus:
         size = len(gradient)
         if size == 0:
             return None
-        row_times, xyzw = self['image_row_s'], self['image_rotation_xyzw']
-        t, velocities = self['image_direction'], self['image_velocities']
+        row_times = self['image_row_s']
+        xyzw = self['image_rotation_xyzw']
+        t = self['image_direction']
+        velocities = self['image_velocities']
         upper = self['image_information']
         has_direction = len(t) == 3 and len(velocities) == 6 and _is_unit(t)
         has_size = size == ROTATION or (size == POSE and has_direction)
@@ -186,7 +188,8 @@ class PairStatus:
                 f'{POSE} or {ROTATION} unknowns, got {size}'
             )
         if size == ROTATION:
-            t, velocities = np.full(3, math.nan), np.full(6, math.nan)
+            t = np.full(3, math.nan)
+            velocities = np.full(6, math.nan)
         H = np.zeros((size, size))
         H[rows] = H.T[rows] = upper
         _refuse_indefinite(H)
@@ -209,7 +212,8 @@ class PairStatus:
     def topics(self) -> set[str]:
         """Topics of the pair, ``~/pairs`` included."""
         text = self._text(outgoing.TOPICS_KEY)
-        topics, with_rotation = set(text.split()), {'relative_rotation'}
+        topics = set(text.split())
+        with_rotation = {'relative_rotation'}
         if topics not in (set(), with_rotation, with_rotation.union(outgoing.POSE_TOPICS)):
             raise InputError(
                 f'{outgoing.TOPICS_KEY} of ~/pairs must name all others, '
@@ -264,7 +268,8 @@ def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
         return _with_pose(pair, messages)
     if 'relative_rotation' not in messages:
         return pair
-    imu, topic = messages['relative_rotation'], '~/relative_rotation'
+    imu = messages['relative_rotation']
+    topic = '~/relative_rotation'
     covariance, velocity_covariance = np.full((2, 6, 6), math.nan)
     covariance[3:, 3:] = _covariance(topic, imu.orientation_covariance, 3)
     velocity_covariance[3:, 3:] = _covariance(topic, imu.angular_velocity_covariance, 3)
@@ -281,8 +286,10 @@ def _with_pose(pair: PublishedPair, messages: Mapping[str, Any]) -> PublishedPai
     """The pair with what the topics of a pose have."""
     if time_ns(messages['reference'].time_ref) != pair.reference_stamp_ns:
         raise InputError('~/reference and ~/pairs must name the same reference keyframe')
-    pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
-    linear, angular = twist.twist.linear, twist.twist.angular
+    pose = messages['relative_pose'].pose
+    twist = messages['velocity'].twist
+    linear = twist.twist.linear
+    angular = twist.twist.angular
     return replace(
         pair,
         has_pose=True,
@@ -346,7 +353,8 @@ def _rays(records: NDArray[np.void], view: str) -> Array:
 def _refuse_indefinite(information: Array) -> None:
     """InputError unless an information (K, K) is positive semidefinite, and not absurdly large."""
     values = np.linalg.eigvalsh(information)
-    least, most = values[0], values[-1]
+    least = values[0]
+    most = values[-1]
     # Written so that NaN is refused, too.
     if not (-_LEAST_INFORMATION * most <= least and 0.0 < most < _MOST_INFORMATION):
         raise InputError(
@@ -395,7 +403,7 @@ _OF_MEDIAN = 1.2533
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPose:
-    """A camera of the path, in the axes of the chain: those of its first camera."""
+    """A camera of the path, in the axes of the first camera of the chain."""
 
     stamp_ns: int
     R: Array  # (3, 3)
@@ -437,7 +445,7 @@ class PoseChain:
 
     def __init__(self, min_shared_tracks: int = 8) -> None:
         self._min_shared_tracks = validate.number('min_shared_tracks', min_shared_tracks, 1)
-        # Of the last camera; None while rotation or position is unknown.
+        # Pose of the last camera; None while rotation or position is unknown.
         self._stamp_ns = 0
         self._R: Array | None = None
         self._position: Array | None = None
@@ -445,8 +453,9 @@ class PoseChain:
         # tracks from its current camera, in these baselines.
         self._scale: float | None = None
         self._distances: dict[int, float] = {}
-        # Of the next path: its reason, and whether its axes are new, too.
-        self._reason, self._new_axes = 'the first pair: a path begins', True
+        # Why the next path begins, and whether its axes are new, too.
+        self._reason = 'the first pair: a path begins'
+        self._new_axes = True
 
     def add(self, pair: PublishedPair) -> PathStep:
         """Append a pair, to the path or as the first of a new one."""
@@ -496,7 +505,8 @@ class PoseChain:
         self._position = self._scale = None
         self._distances = {}
         if new_axes:
-            self._R, self._new_axes = None, True
+            self._R = None
+            self._new_axes = True
 
 
 def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, float]]:
@@ -513,6 +523,9 @@ def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, fl
     baselines = pair.t + row_times[:, None] * velocity
     distances1, distances2, usable = depths_of_rays(rays1, rays2, baselines, _PARALLEL)
     tracks = matches['id'][usable].tolist()
-    of_reference = zip(tracks, distances1[usable].tolist(), strict=True)
-    of_current = zip(tracks, distances2[usable].tolist(), strict=True)
-    return dict(of_reference), dict(of_current)
+    of_reference = distances1[usable].tolist()
+    of_current = distances2[usable].tolist()
+    return (
+        dict(zip(tracks, of_reference, strict=True)),
+        dict(zip(tracks, of_current, strict=True)),
+    )

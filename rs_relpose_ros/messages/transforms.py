@@ -70,7 +70,8 @@ class FrameTree:
 
     def _in_root(self, frame: str) -> tuple[str, Array]:
         """The frame without a parent above a frame, and the pose (4, 4) of the frame in it."""
-        frame, pose = frame.lstrip('/'), np.eye(4)
+        frame = frame.lstrip('/')
+        pose = np.eye(4)
         for _ in self._parents:  # at most: a circle has no root
             if frame in self._parents:
                 frame, step = self._parents[frame]
@@ -140,7 +141,8 @@ def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
 
     /tf is read, too, until IMU and camera are connected, and the camera and `base` if it is given.
     """
-    camera, imu = _frame_id(bag, topics.image), _frame_id(bag, topics.imu)
+    camera = _frame_id(bag, topics.image)
+    imu = _frame_id(bag, topics.imu)
     frames = BagFrames(camera, imu, FrameTree())
 
     def messages_of(name: str) -> Iterator[Any]:

@@ -207,13 +207,14 @@ _TRACKED: dict[str, Callable[[Tracked, Applied], str]] = {
 
 
 class FrameStatistics(ABC):
-    """Fields that every node has, thread-safe; a subclass adds those of its results.
+    """Fields that every node has, thread-safe; a subclass adds the fields of its results.
 
     `clock`: monotonic [ns]; set by tests.
     """
 
     # States without results, and with a configured parameter that is wrong.
-    idle, wrong = 'not working', 'told wrong'
+    idle = 'not working'
+    wrong = 'told wrong'
     last = 'last_failure'  # key of the last failure
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -275,19 +276,26 @@ class FrameStatistics(ABC):
         now_ns = self._clock()
         with self._lock:
             elapsed = max((now_ns - self._since_ns) / NANOSECONDS, 1e-3)
-            before, self._since_ns, self._counted = self._counted, now_ns, inputs
+            before = self._counted
+            self._since_ns = now_ns
+            self._counted = inputs
             refused = Counter({} if counts is None else counts.refused)
-            dropped, self._refused = refused - self._refused, refused
+            dropped = refused - self._refused
+            self._refused = refused
             taken = 0 if counts is None else counts.frames_taken
-            used, self._taken = taken - self._taken, taken
-            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            used = taken - self._taken
+            self._taken = taken
+            busy = self._busy_ns / NANOSECONDS / elapsed
+            self._busy_ns = 0
             if not problem and dropped and used <= 0:
                 problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
             level, text = self._evaluate(problem, dropped)
             if progress is not None:
-                level, text = OK, progress.text
+                level = OK
+                text = progress.text
             if warning and level == OK:
-                level, text = WARN, warning
+                level = WARN
+                text = warning
             by_level = {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}
             state = self.idle if problem else by_level[level]
             values: dict[str, object] = {'state': state, 'missing': ', '.join(missing)}
@@ -376,7 +384,7 @@ def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
 
 
 def evaluate_faults(health: Assessment) -> tuple[int, str]:
-    """Level and text of a calibration with faults: those of the worst one."""
+    """Level and text of a calibration with faults, by the worst of them."""
     worst = health.faults[0]
     level = ERROR if worst.state is FindingState.WRONG else WARN
     return level, findings_text.line(worst)
@@ -385,7 +393,8 @@ def evaluate_faults(health: Assessment) -> tuple[int, str]:
 class Statistics(FrameStatistics):
     """Fields of relpose_node; thread-safe."""
 
-    idle, last = 'not estimating', 'last_reason_no_pose'
+    idle = 'not estimating'
+    last = 'last_reason_no_pose'
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(clock)
@@ -417,7 +426,8 @@ class Statistics(FrameStatistics):
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
 
     def _values(self) -> dict[str, object]:
-        last, pose = self._last_pair, self._last_pose
+        last = self._last_pair
+        pose = self._last_pose
         health = NOT_EVALUATED if last is None else last.health
         tracked = dict.fromkeys(_TRACKED, '')
         if last is not None and last.tracked is not None and last.tracked.pairs:
@@ -449,7 +459,8 @@ class LineFile:
     def __init__(
         self, parameter: str, path: str, report: Callable[[str], object] = lambda text: None
     ) -> None:
-        self._name, self._report = f'{parameter} {path}', report
+        self._name = f'{parameter} {path}'
+        self._report = report
         try:
             self._file: TextIO | None = Path(path).open(  # noqa: SIM115 closed by close
                 'w', buffering=1, encoding='ascii'
@@ -496,7 +507,8 @@ class FrameTimings:
 
     def add(self, frame: Frame[PairResult]) -> None:
         """Write a frame; call it right after its result was published."""
-        done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
+        done_ns = time.monotonic_ns()
+        spent_ns = time.thread_time_ns()
         outcome = 'none' if frame.result is None else frame.result.pose.status.value
         self._file.write(
             f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
@@ -532,7 +544,8 @@ class ReasonLog:
         now = self._clock()
         with self._lock:
             if kind not in self._last and len(self._last) >= MOST_REASONS:
-                kind, text = '', 'further problems of other kinds (see /diagnostics)'
+                kind = ''
+                text = 'further problems of other kinds (see /diagnostics)'
             last = self._last.get(kind)
             if last is not None and now - last[0] < self._period:
                 self._last[kind] = (last[0], last[1] + 1)
@@ -551,7 +564,10 @@ class HealthLog:
     def __init__(
         self, info: ReasonLog, warn: ReasonLog, error: ReasonLog, results: str = 'poses'
     ) -> None:
-        self._info, self._warn, self._error, self._results = info, warn, error, results
+        self._info = info
+        self._warn = warn
+        self._error = error
+        self._results = results
         self._reported_faults = False
 
     def __call__(self, health: Assessment, *, withhold: bool) -> None:
@@ -559,7 +575,8 @@ class HealthLog:
         faults = health.faults
         if faults:
             # Numbers and lesser faults change from pair to pair, the worst parameter hardly.
-            text, kind = '; '.join(map(findings_text.line, faults)), faults[0].code.value
+            text = '; '.join(map(findings_text.line, faults))
+            kind = faults[0].code.value
             if health.is_gross:
                 # A gross error has a fix of its own, unlike the first small steps.
                 kind += ', gross'

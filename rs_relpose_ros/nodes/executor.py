@@ -1,4 +1,4 @@
-"""The executor of the nodes: few wake-ups, and cheap ones; else that of rclpy.
+"""The executor of the nodes, with few and cheap wake-ups; where it fails, rclpy has its own.
 
 For each message rclpy builds two wait sets of all entities of the node, in Python, which costs
 more than the message. `KeptWaitSet` lists the entities once. An IMU would still wake it hundreds
@@ -111,8 +111,10 @@ class KeptWaitSet(SingleThreadedExecutor):
 
     def _list_entities(self) -> None:
         (node,) = self.get_nodes()
-        self._timers, self._services = [*node.timers], [*node.services]
-        self._subscriptions, self._events = [*node.subscriptions], [*node.waitables]
+        self._timers = [*node.timers]
+        self._services = [*node.services]
+        self._subscriptions = [*node.subscriptions]
+        self._events = [*node.waitables]
         with_handles: list[Any] = [*self._timers, *self._services, *self._subscriptions]
         with_handles += [self._guard, self.context]
         for used in (*(entity.handle for entity in with_handles), *self._events):
@@ -164,9 +166,10 @@ def _self_test(executor: SingleThreadedExecutor, node: Node) -> str:
     """Whether an executor runs a task and a timer of its node; why not, empty if it does."""
     if not hasattr(rclpy_implementation.Subscription, 'take_message'):
         return 'subscriptions of this rclpy have no take_message'
-    task_ran, timer_ran = threading.Event(), threading.Event()
+    task_ran = threading.Event()
+    timer_ran = threading.Event()
     executor.create_task(task_ran.set)
-    steady = Clock(clock_type=ClockType.STEADY_TIME)  # that of the node may be /clock
+    steady = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of the node may be /clock
     timer = node.create_timer(0.0, timer_ran.set, clock=steady)
     end = time.monotonic() + _TEST_TIME
     try:
@@ -204,7 +207,8 @@ class PolledSubscription:
         urgent: Callable[[], bool],
         **options: Any,
     ) -> None:
-        self._node, self._receive = node, receive
+        self._node = node
+        self._receive = receive
         self._subscription = node.create_subscription(
             msgtype, topic, self.drain, qos, callback_group=_WhileUrgent(urgent), **options
         )

@@ -62,7 +62,8 @@ class _Statistics(FrameStatistics):
         super().__init__(clock)
         self._images = self._withheld = 0
         self._last: global_shutter.GlobalShutterFrame | None = None
-        self._health, self._source = NOT_EVALUATED, ''
+        self._health = NOT_EVALUATED
+        self._source = ''
 
     def add_image(
         self,
@@ -80,7 +81,9 @@ class _Statistics(FrameStatistics):
         with self._lock:
             self._images += not withheld
             self._withheld += withheld
-            self._last, self._health, self._source = frame, health, source
+            self._last = frame
+            self._health = health
+            self._source = source
             self._published(ready_ns)
 
     def _evaluate_results(self) -> tuple[int, str]:
@@ -111,7 +114,7 @@ class GlobalShutterNode(SensorNode):
 
     def __init__(self) -> None:
         self._statistics = _Statistics()
-        # With its time [s] and the name of its node.
+        # The last state of relpose_node, with its time [s] and the name of that node.
         self._of_others: tuple[float, Assessment, str] | None = None
         super().__init__(NAME, self._statistics)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)

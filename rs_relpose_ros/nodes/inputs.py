@@ -64,11 +64,13 @@ class TransformLookup:
     """
 
     def __init__(self, node: Node) -> None:
-        self.problem, self._listener = '', None
+        self.problem = ''
+        self._listener = None
         try:
             self._tf2: Any = importlib.import_module('tf2_ros')
         except ImportError:
-            self._tf2, self.problem = None, 'tf2_ros is not installed'
+            self._tf2 = None
+            self.problem = 'tf2_ros is not installed'
             return
         self._buffer = self._tf2.Buffer()
         self._listener = self._tf2.TransformListener(self._buffer, node)
@@ -85,7 +87,8 @@ class TransformLookup:
         if self._listener is not None:
             self._listener.unregister()
             self._listener = None
-        t, q = found.translation, found.rotation
+        t = found.translation
+        q = found.rotation
         return t.x, t.y, t.z, q.x, q.y, q.z, q.w
 
 
@@ -150,7 +153,9 @@ class SensorInputs:
         image_transport: str,
         on_invalid: Callable[[str], None],
     ) -> None:
-        self._node, self._intake, self._on_invalid = node, intake, on_invalid
+        self._node = node
+        self._intake = intake
+        self._on_invalid = on_invalid
         self._info: Any = None  # the last CameraInfo, without its stamp
         self._started_ns = time.monotonic_ns()
         self.counts: Counter[str] = Counter()  # of messages by role, and of the `INVALID` ones
@@ -160,7 +165,7 @@ class SensorInputs:
         self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)  # of the last images
         self.topics = {role: node.resolve_topic_name(role.value) for role in TOPICS}
         compressed = image_transport == 'compressed'
-        # As image_transport does: the transport's name follows the remapped one.
+        # The name of the transport follows the remapped topic, as in image_transport.
         self.topics[Role.IMAGE] += '/compressed' if compressed else ''
         self._polled = [
             self._camera_info(best_effort(_IMAGE_DEPTH), qos_overriding_options=overridable()),

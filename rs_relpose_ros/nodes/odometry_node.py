@@ -114,7 +114,8 @@ class OdometryNode(StoppableNode):
             self._lookup = inputs.TransformLookup(self)
 
     def _begin(self, parameters: Parameters) -> None:
-        self._begun, self._config = True, parameters.odometry
+        self._begun = True
+        self._config = parameters.odometry
         self._use(parameters)
         self._sample_at = time.monotonic()
         self._frames: dict[Role, str] = {}  # of the samples

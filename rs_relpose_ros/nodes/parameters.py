@@ -36,7 +36,7 @@ class NodeParameters:
         }
         given = {name: value for name, value in values.items() if value is not None}
         self.current = Parameters.from_mapping(given)
-        # Those of the user, which a calibration does not replace.
+        # Names of the parameters that the user has given: a calibration does not replace them.
         self._given = set(self.current.given())
         self._adopting = False
         node.add_on_set_parameters_callback(self._validate)
@@ -74,7 +74,7 @@ class NodeParameters:
             self._on_change(self.current)
 
     def _known(self, parameters: list[Parameter]) -> dict[str, Any]:
-        """Those of the package; use_sim_time and QoS overrides are handled by rclpy."""
+        """Values of our parameters; rclpy itself handles use_sim_time and QoS overrides."""
         ours = self.current.to_mapping()
         return {p.name: _plain(p.value) for p in parameters if p.name in ours}
 

@@ -300,7 +300,7 @@ class SensorNode(StoppableNode):
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
         self._reported_silence = ''
-        # For diagnostics and time-outs, which must run although /clock may not advance.
+        # This clock drives diagnostics and time-outs, which must run while /clock stands still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         with ros_parameters.legal_qos():
             self._open_outputs(self._settings.current)
@@ -479,7 +479,8 @@ class SensorNode(StoppableNode):
             self._found = outcome
 
     def _use_found(self) -> None:
-        found, self._found = self._found, None
+        found = self._found
+        self._found = None
         if found is not None:
             self._use_calibration(found)
 
@@ -507,8 +508,9 @@ class SensorNode(StoppableNode):
 
     def _use_transform(self, frame_ids: Mapping[Role, str]) -> None:
         """Extrinsics from /tf_static, once it is there: parameters, or start of a calibration."""
-        camera, imu = frame_ids.get(Role.IMAGE), frame_ids.get(Role.IMU)
-        # Of one frame_id for both sensors the axes are not known.
+        camera = frame_ids.get(Role.IMAGE)
+        imu = frame_ids.get(Role.IMU)
+        # If both sensors have one frame_id, the axes of the IMU are not known.
         if self._lookup is None or not camera or not imu or camera == imu:
             return
         found = self._lookup(camera, imu)
@@ -549,7 +551,8 @@ class SensorNode(StoppableNode):
         try:
             path = stored.path_of(self._settings.current.calibration, found.camera)
             stored.save(path, found.camera, found.parameters)
-            response.success, response.message = True, f'stored in {path}'
+            response.success = True
+            response.message = f'stored in {path}'
         except InputError as error:
             response.message = str(error)
         return response

@@ -48,7 +48,7 @@ def draw_errors(
     path: Path,
     baselines: Mapping[str, Sequence[PairErrors | None]] | None = None,
 ) -> None:
-    """Errors over time, with estimated sigmas; `baselines`: those of other methods, by name."""
+    """Errors over time, with estimated sigmas; `baselines`: errors of other methods, by name."""
     picture = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
     known = [record for record in records if record.pose and record.errors is not None]

@@ -116,7 +116,9 @@ class Replay:
     ) -> None:
         need_sensor_parameters(parameters)
         self.parameters = parameters
-        self._bag, self._topics, self._stamps = bag, topics, stamps
+        self._bag = bag
+        self._topics = topics
+        self._stamps = stamps
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
         self.sequencer = self._front_end.sequencer
         self.intake = Intake(self.sequencer, parameters, stamps)
@@ -176,7 +178,8 @@ class Replay:
     def _messages(self) -> Iterator[tuple[Role, BagMessage]]:
         for role, message in sensor_messages(self._bag, self._topics):
             self.first_ns = self.first_ns or message.bag_time_ns
-            self.last_ns, self.read_ns = message.bag_time_ns, message.read_ns
+            self.last_ns = message.bag_time_ns
+            self.read_ns = message.read_ns
             yield role, message
 
 
@@ -219,14 +222,17 @@ def replay_into(
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE, *PICTURES))
     records: list[PairRecord] = []
     shown: PairResult | None = None
-    last, health, best = None, NOT_EVALUATED, (False, 0.0)
+    last = None
+    health = NOT_EVALUATED
+    best = (False, 0.0)
     written = (POSES,) if truth is None else (POSES, ERRORS)
     with ExitStack() as stack:
         write_record = stack.enter_context(tables.table_writer(folder, written))
         writer = stack.enter_context(BagWriter(out_bag)) if with_bag else None
         for pair in run.pairs():
             records.append(PairRecord.of(pair, truth))
-            last, health = pair, worst_of(health, pair.health)
+            last = pair
+            health = worst_of(health, pair.health)
             write_record(records[-1])
             if writer is not None:
                 parts = pair_parts(pair, writer.type, parameters.pair.reference_frame)
@@ -236,7 +242,8 @@ def replay_into(
             # The better picture: with a pose, many inliers and much parallax.
             rank = bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
             if pictures and (shown is None or rank > best):
-                shown, best = pair, rank
+                shown = pair
+                best = rank
     health = worst_of(health, run.health)
     files = [folder / table.file for table in written] + [out_bag] * with_bag
     if shown is not None:
@@ -254,7 +261,8 @@ def _summary(
 ) -> dict[str, Any]:
     """Content of summary.json; medians are over the pairs with a pose, null without any."""
     answered = [record for record in records if record.pose]
-    sequencer, seconds = run.sequencer.counts(), run.processing_seconds
+    sequencer = run.sequencer.counts()
+    seconds = run.processing_seconds
     taken = sequencer.frames_taken
     return {
         'pairs': pair_counts(records),
@@ -307,7 +315,8 @@ def pair_counts(records: list[PairRecord]) -> dict[str, Any]:
 def _tracked(last: PairResult | None) -> dict[str, Any] | None:
     if last is None or last.tracked is None or not last.tracked.pairs:
         return None
-    tracked, applied = last.tracked, last.applied
+    tracked = last.tracked
+    applied = last.applied
     return {
         'gyro_bias_rad_s': tracked.gyro_bias.tolist(),
         'gyro_bias_sigma_rad_s': tracked.gyro_bias_sigma.tolist(),

@@ -36,7 +36,9 @@ class PairRecord:
     @classmethod
     def of(cls, result: PairResult, truth: TrueTrajectory | None = None) -> Self:
         """Record of a pair, with its errors if there is ground truth."""
-        pose, ns1, ns2 = result.pose, result.reference_ns1, result.reference_ns2
+        pose = result.pose
+        ns1 = result.reference_ns1
+        ns2 = result.reference_ns2
         return cls(
             result.reference_stamp_ns,
             result.stamp_ns,
@@ -67,7 +69,7 @@ def _pose_row(record: PairRecord) -> list[str]:
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
     if not pose.rotation_known:
         return [*stamps, *[''] * 13, matches, '', pose.status.value, '', '']
-    # As published: of the pose, or of the rotation alone.
+    # The sigmas are those of the published covariance: of the pose, or of the rotation alone.
     covariance = np.full((6, 6), math.nan)
     known = slice(0 if pose else 3, 6)
     published = published_covariance(pose.covariance[known, known])
@@ -195,7 +197,8 @@ def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
 
 def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
     """Number of poses with a metric baseline, its median sigma, and the reasons of the others."""
-    known, reasons = [], ReasonCounts()
+    known = []
+    reasons = ReasonCounts()
     for record in answered:
         if record.pose.diagnostics.baseline_reason:
             reasons.add(record.pose.diagnostics.baseline_reason)

@@ -39,12 +39,14 @@ class Unrolling:
         self.copied = self.topics_copied = 0  # messages of other topics
         self.reasons = ReasonCounts()  # of omitted images
         self.warnings: list[str] = []
-        self._bag, self._topics, self._writer = bag, topics, writer
+        self._bag = bag
+        self._topics = topics
+        self._writer = writer
         self._loop = unrolling_loop(parameters, offline=True)
         self._intake = Intake(self._loop.sequencer, parameters)
-        # By the stamps of all images, the receive times of those that are not yet derotated.
+        # Stamps of all images, with the receive times of the images that are not derotated yet.
         self._times: dict[int | None, deque[int]] = {}
-        # Of other image topics: whether the stamp is an image's.
+        # For each other image topic, whether its messages have stamps of derotated images.
         self._shared: dict[str, list[bool]] = {}
 
     def write(self, stamp_clock: str) -> None:

@@ -59,10 +59,14 @@ class RowMap(NamedTuple):
         """Bands of rows, which fit into a cache, and sources (N, W, 2) for `cv2.remap`."""
         for top in range(0, self.height, _BAND):
             bottom = min(top + _BAND, self.height)
-            nodes = self.nodes[top // _STEP : math.ceil(bottom / _STEP) + 2]
-            size = nodes.shape[1] * _STEP, nodes.shape[0] * _STEP
+            last_node = math.ceil(bottom / _STEP) + 2
+            nodes = self.nodes[top // _STEP : last_node]
+            rows, columns, _ = nodes.shape
+            size = columns * _STEP, rows * _STEP
             band = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
-            sources = band[_STEP : _STEP + bottom - top, _STEP : _STEP + self.width]
+            # The image begins one node inside of the band.
+            inner = band[_STEP:, _STEP:]
+            sources = inner[: bottom - top, : self.width]
             yield slice(top, bottom), np.asarray(sources)
 
 
@@ -87,7 +91,8 @@ class MiddleRow:
         """Where the pixels come from, for a motion relative to the reference row of the camera."""
         camera = self.sensor.camera
         intrinsics = self.sensor.intrinsics
-        # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
+        # Rotations from the camera at the middle row to the camera at each of some rows:
+        # R(tau)^T R_mid.
         rows = np.linspace(0.0, camera.row_count - 1.0, _ORIENTATIONS)
         turns = np.einsum(
             'nji,jk->nik',
@@ -120,7 +125,7 @@ _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 @dataclass(frozen=True, eq=False)
 class GlobalShutterFrame:
-    """A frame as of a global shutter at the time of the middle row."""
+    """A frame as a global shutter would take it at the time of the middle row."""
 
     stamp_ns: int  # time of the middle row, on the clock of the parameter stamp_clock
     original: Pixels
@@ -301,7 +306,7 @@ class RotationWatch(Processor[None]):
             self._begin = frame
             self._last_ns = frame.stamp_ns
             return
-        # Not predicted by the gyro, which may be wrong.
+        # The gyro, which may be wrong, does not predict the points.
         matches = self._tracker.track(frame.image)
         camera = sensor_model(frame.intrinsics, parameters.sensor).camera
         rays1 = camera.unproject(frame.intrinsics.to_sensor(matches.points1))
@@ -333,7 +338,7 @@ class RotationWatch(Processor[None]):
 def unrolling_loop(
     parameters: Parameters, *, offline: bool = False, watched: Callable[[], bool] = lambda: False
 ) -> FrameLoop[GlobalShutterFrame]:
-    """The loop that derotates frames; `watched` is that of `Unroller`."""
+    """The loop that derotates frames; `watched` is an argument of `Unroller`."""
     return FrameLoop(
         parameters,
         Unroller(watched),

@@ -58,7 +58,7 @@ class Frame(Generic[Result]):
     exposure: float = 0.0  # of a row [s], over which the gyro is averaged
     applied_offset_ns: int = 0  # tracked time offset in its IMU data, beyond the parameter's
     ahead: float = 0.0  # [s] newest stamp of the gyro as the image came, less the stamped row's
-    # For derotated images, whose `image` is (H, W) or (H, W, C) in its own encoding.
+    # Images that are to be derotated have an `image` (H, W) or (H, W, C) in their own encoding.
     encoding: str = 'mono8'
     encoded: EncodedImage | None = None
     restart: bool = False  # time jumped since the frame before: tracks belong to another time
@@ -418,9 +418,9 @@ class TrackHistory:
         return '', (None, *on_the_way, whole)
 
     # Each step of a tracker adds its error, and the windows of a pair's last frame are aligned
-    # with those of its first one: the drift of a track is known there. The drift of an earlier
-    # frame is interpolated linearly in time: that is the expected value of a random walk whose
-    # two ends are known.
+    # with the windows of its first one: the drift of a track is known there. The drift of an
+    # earlier frame is interpolated linearly in time: that is the expected value of a random walk
+    # whose two ends are known.
 
     def _drifted(
         self, matches: Matches, between: Sequence[tuple[FrameImu, ImuSlice | None, Matches]]

@@ -140,7 +140,8 @@ class Pipeline(Processor[PairResult]):
         new = self._new_image(frame.stamp_ns, frame.image, frame.imu, previous.imu, sensor)
         if new is None:
             return None
-        frame.imu_data, step = new, new.since_previous
+        frame.imu_data = new
+        step = new.since_previous
         assert step is not None
         predicted = self._predicted(previous.imu.motion, frame.imu.motion, step.rotation, sensor)
         passed = seconds_between(previous.stamp_ns, frame.stamp_ns)
@@ -199,7 +200,7 @@ class Pipeline(Processor[PairResult]):
             self.reset()
             self._monitor = ConsistencyMonitor()
         if sensor != self._sensor:
-            self._of_previous = None  # its row times are those of the camera before
+            self._of_previous = None  # its row times belong to the camera before
         self._sensor = sensor
         self._readout = self.applied.readout_time
         return sensor
@@ -271,7 +272,7 @@ class Pipeline(Processor[PairResult]):
     def _compare_rotations(
         self, stamp_ns: int, matches: Matches, by_gyro: Array, sensor: Sensor, keyframe: bool
     ) -> None:
-        """Compare the rotation of the images over some frames with that of the gyro.
+        """Compare the rotation by the images over some frames with the rotation by the gyro.
 
         `by_gyro` (3, 3): since the previous image.
         """
@@ -493,7 +494,7 @@ class FrameLoop(Generic[Result]):
 
 
 class FrontEnd(FrameLoop[PairResult]):
-    """The loop that makes keyframe pairs; arguments as of `FrameLoop` and `Pipeline`."""
+    """The loop that makes keyframe pairs; it takes the arguments of `FrameLoop` and `Pipeline`."""
 
     def __init__(
         self,

@@ -320,7 +320,8 @@ class Sequencer:
             if self._colors:
                 values, encoding = image.pixels(self._levels)
             else:
-                values, encoding = image.decoded(self._levels), 'mono8'
+                values = image.decoded(self._levels)
+                encoding = 'mono8'
             frame: Frame[Any] = Frame(
                 image.stamp_ns,
                 values,

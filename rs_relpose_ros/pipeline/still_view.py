@@ -96,7 +96,8 @@ class StillView:
 def _range(are_static: Flags, size: int) -> list[int]:
     """First and last pixel of the flagged cells, which divide `size` pixels evenly."""
     cells = np.flatnonzero(are_static)
-    first, last = cells[0], cells[-1] + 1
+    first = cells[0]
+    last = cells[-1] + 1
     return [round(size * cell / len(are_static)) for cell in (first, last)]
 
 

@@ -95,11 +95,14 @@ def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator
     """A few made-up frames, as processed by an offline loop."""
     images = list(_images())
     frame_ns = NANOSECONDS // 30
+    rate = (0.01, 0.02, 0.03)
     force = (0.0, -9.81, 0.0) if with_force else None
-    for stamp_ns in range(0, (len(images) + 3) * frame_ns, NANOSECONDS // 200):
-        loop.sequencer.add_imu(ImuSample(NANOSECONDS + stamp_ns, (0.01, 0.02, 0.03), force))
+    end_ns = NANOSECONDS + (len(images) + 3) * frame_ns
+    for stamp_ns in range(NANOSECONDS, end_ns, NANOSECONDS // 200):
+        loop.sequencer.add_imu(ImuSample(stamp_ns, rate, force))
     for k, image in enumerate(images, start=1):
-        loop.sequencer.add_frame(RawImage.of_gray(image, NANOSECONDS + k * frame_ns), _INTRINSICS)
+        stamped = RawImage.of_gray(image, NANOSECONDS + k * frame_ns)
+        loop.sequencer.add_frame(stamped, _INTRINSICS)
         outcome = loop.step()
         assert isinstance(outcome, Frame), outcome
         yield outcome
