@@ -56,6 +56,10 @@ class Code(str, Enum):
     ACCEL_SCALE = 'accel_scale'
     REPEATED_IMAGES = 'repeated_images'
     STATIC_REGION = 'static_region'
+    # Causes that the odometry names.
+    GYRO_NOISE = 'gyro_noise'
+    ACCEL_NOISE = 'accel_noise'
+    KNOCK = 'knock'
     # Properties of a recording: `is_property`.
     TOPICS = 'topics'
     PARAMETERS = 'parameters'

@@ -16,63 +16,72 @@ UNKNOWN_ARM = 0.15
 # Least 1 sigma of the position of the IMU [m]: with 0 the graph has no finite information.
 # [chosen: 1e-5 to 1e-3 would do: millimetres of the arm move no path]
 _LEAST_ARM_SIGMA = 1e-4
+# 1 sigma of the scale of each axis of the gyro. A smaller one excludes gyros of phones, which are
+# off by 1 to 2 %; a larger one delays what the images tell of the gyro's bias.
+# [chosen: 0.01 to 0.03 would do: 0.2 s of rotation determine the scale better]
+_GYRO_SCALE = 0.02
+# 1 sigma of the angles between the axes of the gyro [rad], likewise.
+# [chosen: 0.003 to 0.01 would do: data sheets have 0.1 to 1 % of cross-axis sensitivity]
+_GYRO_SKEW = 0.005
 
 # Size of the position of the camera on the body, with which the vector begins.
 ARM = slice(0, 3)
+# Sizes of the last parts of the vector by name: the symmetric gyro matrix.
+_GYRO_PARTS = {'gyro_scale': slice(-6, -3), 'gyro_skew': slice(-3, None)}
+# Number of values of the gyro matrix. [derived: of a symmetric matrix of 3 rows]
+_GYRO_MATRIX = 6
 # Share of the readout between the stamped and the middle row, by `stamp_row`.
 _MIDDLE_SHARES = {'first': 0.5, 'middle': 0.0, 'last': -0.5}
 
 
 class Doubts:
-    """The vector d (3 + k,) of a graph: position of the camera on the body, and k deviations.
+    """The vector d (3 + k + 6,) of a graph: position of the camera on the body, k deviations.
 
-    The deviations are those of IMAGES whose sigma is configured: all others are taken as
-    exact, so that a graph without doubt has the unknown position alone.
+    The k deviations are those of IMAGES whose sigma is configured: all others are taken as
+    exact. The last six are the scale and the skew of the gyro, as of `core.deviations`.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         sensor, imu = parameters.sensor, parameters.imu
-        self._R_cam_body = sensor.R_cam_imu
+        self.R_cam_body_configured = sensor.R_cam_imu
         lever = np.array(imu.imu_position)
         self.arm_is_known = bool(lever.any())
-        least = _LEAST_ARM_SIGMA if self.arm_is_known else UNKNOWN_ARM
-        # A parameter that relpose_node tracks is not constant: its deviation is no unknown.
-        configured = {
-            'axes': sensor.axes_sigma,
-            'time_offset': 0.0 if sensor.track_time_offset else sensor.time_offset_sigma,
-            'readout_time': 0.0 if sensor.track_readout_time else sensor.readout_time_sigma,
-            'focal_log': parameters.intrinsics.focal_length_sigma,
-            'distortion': parameters.intrinsics.distortion_sigma,
-            'principal_point': parameters.intrinsics.principal_point_sigma,
-        }
-        sigmas = np.zeros(IMAGES.size)
-        for name, columns in IMAGES.parts.items():
-            sigmas[columns] = configured[name]
+        sigmas = _configured_sigmas(parameters)
         # Which deviations are unknown, as indices.
         self.active = np.flatnonzero(sigmas)
-        self._middle_share = _MIDDLE_SHARES[sensor.stamp_row]
-        arm_sigmas = np.full(3, max(imu.imu_position_sigma, least))
-        self.prior_sigmas = np.concatenate([arm_sigmas, sigmas[self.active]])
-        self.prior = np.zeros(len(self.prior_sigmas))
-        self.prior[ARM] = -self._R_cam_body.T @ lever
+        least = _LEAST_ARM_SIGMA if self.arm_is_known else UNKNOWN_ARM
+        self.prior_sigmas = np.concatenate(
+            [
+                np.full(3, max(imu.imu_position_sigma, least)),
+                sigmas[self.active],
+                np.full(3, _GYRO_SCALE),
+                np.full(3, _GYRO_SKEW),
+            ]
+        )
+        self.size = len(self.prior_sigmas)
+        # Places of the deviations of the images and of the gyro matrix.
+        self.images = slice(ARM.stop, self.size - _GYRO_MATRIX)
+        self.gyro_matrix = slice(self.images.stop, self.size)
+        self.prior = np.zeros(self.size)
+        self.prior[ARM] = -self.R_cam_body_configured.T @ lever
         # Derivatives (4, k) of the rotation of the camera and of the delay of its keyframes, the
         # middle rows, by the active deviations.
         by_all = np.zeros((4, IMAGES.size))
         by_all[:3, IMAGES.part('axes')] = np.eye(3)
         by_all[3, IMAGES.part('time_offset')] = 1.0
-        by_all[3, IMAGES.part('readout_time')] = self._middle_share
+        by_all[3, IMAGES.part('readout_time')] = _MIDDLE_SHARES[sensor.stamp_row]
         self.by_mount = by_all[:, self.active]
 
     def mount(self, d: Array) -> tuple[Array, float]:
         """Rotation vector (3,) of the camera's axes [rad], and delay of keyframes [s]."""
         if not len(self.active):
             return np.zeros(3), 0.0
-        mount = self.by_mount @ d[3:]
+        mount = self.by_mount @ d[self.images]
         return mount[:3], float(mount[3])
 
     def R_cam_body(self, d: Array) -> Array:
         """R (3, 3) from the body to the camera."""
-        return exp_so3(self.mount(d)[0]) @ self._R_cam_body
+        return exp_so3(self.mount(d)[0]) @ self.R_cam_body_configured
 
     def named(
         self,
@@ -80,11 +89,40 @@ class Doubts:
         covariance: Array,
     ) -> dict[str, tuple[list[float], list[float]]]:
         """Values and sigmas of the unknown deviations by name."""
+        all_sigmas = np.sqrt(np.diag(covariance))
         values, sigmas = np.zeros(IMAGES.size), np.zeros(IMAGES.size)
-        values[self.active] = d[3:]
-        sigmas[self.active] = np.sqrt(np.diag(covariance)[3:])
-        return {
+        values[self.active] = d[self.images]
+        sigmas[self.active] = all_sigmas[self.images]
+        named = {
             name: (values[columns].tolist(), sigmas[columns].tolist())
             for name, columns in IMAGES.parts.items()
             if sigmas[columns].any()
         }
+        for name, columns in _GYRO_PARTS.items():
+            named[name] = d[columns].tolist(), all_sigmas[columns].tolist()
+        return named
+
+
+def _configured_sigmas(parameters: Parameters) -> Array:
+    """Sigmas of the deviations of IMAGES; 0 for one that is taken as exact."""
+    sensor, lens = parameters.sensor, parameters.intrinsics
+    # A parameter that relpose_node tracks is not constant: its deviation is no unknown.
+    configured = {
+        'axes': sensor.axes_sigma,
+        'time_offset': 0.0 if sensor.track_time_offset else sensor.time_offset_sigma,
+        'readout_time': 0.0 if sensor.track_readout_time else sensor.readout_time_sigma,
+        'focal_log': lens.focal_length_sigma,
+        'distortion': lens.distortion_sigma,
+        'principal_point': lens.principal_point_sigma,
+    }
+    sigmas = np.zeros(IMAGES.size)
+    for name, columns in IMAGES.parts.items():
+        sigmas[columns] = configured[name]
+    return sigmas
+
+
+def by_gyro_matrix(rate: Array) -> Array:
+    """Derivative (3, 6) of the true rate by scale and skew of the gyro, at a rate (3,)."""
+    x, y, z = rate
+    skew = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
+    return np.hstack([np.diag(rate), skew])

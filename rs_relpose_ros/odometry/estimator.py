@@ -866,7 +866,10 @@ class OdometryEstimator:
         arm_by_axes = axes_on_body @ skew(base.R.T @ base.position)
         n = len(state.covariance)
         by_axes = np.zeros((3, n))
-        by_axes[:, ARM.stop :] = self._doubts.by_mount[:3]
+        of_images = self._doubts.images
+        by_axes[:, ARM.start + of_images.start : ARM.start + of_images.stop] = (
+            self._doubts.by_mount[:3]
+        )
         to_world, to_twist = np.zeros((6, n)), np.zeros((6, n))
         to_world[:3, :3] = -state.R @ skew(c)
         to_world[:3, 3:6] = state.R

@@ -6,7 +6,7 @@ Free of gtsam, for graphs of other libraries.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -112,15 +112,14 @@ class Body(NamedTuple):
     @classmethod
     def of(
         cls,
-        pose: Any,
+        pose: Array,
         velocity: Array,
         rate: Array,
         force: Array,
     ) -> Body:
-        """From a ``gtsam.Pose3`` and the specific force (3,) in the axes of the body."""
-        matrix = pose.matrix()
-        R = matrix[:3, :3].copy()
-        return cls(R, matrix[:3, 3].copy(), velocity, rate, R @ force + _GRAVITY)
+        """From a pose as a matrix (4, 4), and the specific force (3,) in the body's axes."""
+        R = pose[:3, :3].copy()
+        return cls(R, pose[:3, 3].copy(), velocity, rate, R @ force + _GRAVITY)
 
 
 class Mount(NamedTuple):

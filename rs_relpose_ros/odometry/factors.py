@@ -1,0 +1,332 @@
+"""Factors of the graph: the samples of the IMU, the images of a pair, a still camera, priors.
+
+Keyframe k has the pose ``X(k)`` and velocity ``V(k)`` of the body and the biases ``B(k)``; all
+keyframes share the vector ``L(0)`` of `doubts`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gtsam
+from gtsam.symbol_shorthand import B, L, V, X
+import numpy as np
+from scipy.special import gammaincinv
+
+from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
+from rs_relpose_ros.core.deviations import slices
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.so3 import skew, STANDARD_GRAVITY
+from rs_relpose_ros.imu.buffer import ImuInterval
+from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.odometry import doubts
+from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
+from rs_relpose_ros.odometry.pair import (
+    Body,
+    COLUMNS,
+    deviations,
+    Measured,
+    Mount,
+    square_root,
+)
+
+# Least random walks and densities of the graph. Below them the sigmas of one graph range over so
+# many decades that its equations are singular to double precision.
+# [measured: docs/lab/odometry.md, "Noise parameters": a graph fails with accel_bias_walk of 4e-5,
+# gyro_bias_walk of 1e-6 or gyro_noise_density of 1e-7]
+#
+# Least walk of the accelerometer's bias [m/s^3/sqrt(Hz)]: 3 mm/s^2 in 100 s, which nobody knows
+# of a bias. A smaller one fails, a larger one would let the bias wander.
+_LEAST_ACCEL_WALK = 3e-4
+# Least walk of the gyro's bias [rad/s^2/sqrt(Hz)]: 1e-4 rad/s in 100 s. A smaller one fails, a
+# larger one would forget a bias that was measured at rest.
+_LEAST_GYRO_WALK = 1e-5
+# Least density of the gyro's noise [rad/s/sqrt(Hz)]: 0.01 mrad in a second, far below the noise of
+# any image. A smaller one fails, a larger one would exceed the noise of the best gyros.
+_LEAST_GYRO_NOISE = 1e-5
+# Least density of the accelerometer's noise [m/s^2/sqrt(Hz)]. A smaller one fails, a larger one
+# would exceed the noise of the best accelerometers.
+_LEAST_ACCEL_NOISE = 1e-4
+# Integration error of the samples, as a noise density of the position [m/sqrt(s)]: the mean of two
+# samples is not the mean of the acceleration between them. [chosen: 0.1 mm after a second, below
+# the noise of any accelerometer]
+_INTEGRATION = 1e-4
+# Share of right loops within the bound of chi squared: 1 % of them are lost.
+# [chosen: 0.95 to 0.999 would do; measured with 0.99 in docs/lab/odometry.md, "Loop closures"]
+_LOOP_QUANTILE = 0.99
+# Change of the specific force between two samples [m/s^2] from which its mean is not known: a
+# knock, whose peak lies between the samples. Steps of a walk change it by less at 50 Hz or more; a
+# smaller bound would take them for knocks, a larger one would trust a knock.
+# [chosen: 15 to 40 would do: hand-held walks reach 5, knocks 50 to 200]
+_KNOCK = 20.0
+# Samples before and after a knock that are as uncertain: it lasts for 5 to 15 ms.
+# [chosen: 1 to 3 would do at 200 Hz]
+_AROUND_KNOCK = 2
+
+# Columns of the derivatives of a pair, by the keys of the two bodies.
+_OF_BODIES = tuple(COLUMNS[key] for key in ('X1', 'V1', 'X2', 'V2'))
+# Columns of the derivatives of an IMU factor, by its keys; those of `doubts` follow.
+IMU = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'B1': 6, 'B2': 6})
+# Number of equations of an IMU factor. [derived: pose, velocity and biases of one body]
+_IMU_ROWS = 15
+# Columns of the biases of the gyro, which follow those of the accelerometer.
+_OF_GYRO_1 = slice(IMU['B1'].start + 3, IMU['B1'].stop)
+# The same of the second keyframe.
+_OF_GYRO_2 = slice(IMU['B2'].start + 3, IMU['B2'].stop)
+
+
+# -- the IMU ----------------------------------------------------------------------------------
+
+
+def preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
+    """Noise densities of the samples for gtsam; that of the accelerometer follows."""
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(STANDARD_GRAVITY)
+    eye = np.eye(3)
+    gyro_walk = max(config.gyro_bias_walk, _LEAST_GYRO_WALK)
+    accel_walk = max(config.accel_bias_walk, _LEAST_ACCEL_WALK)
+    params.setIntegrationCovariance(_INTEGRATION**2 * eye)
+    params.setBiasOmegaCovariance(gyro_walk**2 * eye)
+    params.setBiasAccCovariance(accel_walk**2 * eye)
+    return params
+
+
+def gyro_variance(imu: ImuConfig, errors: float) -> float:
+    """Squared density of the gyro's noise; `errors`: density beyond the configured one."""
+    return max(imu.gyro_noise_density, _LEAST_GYRO_NOISE) ** 2 + errors**2
+
+
+def accel_variance(imu: ImuConfig, errors: float) -> float:
+    """The same of the accelerometer."""
+    return max(imu.accel_noise_density, _LEAST_ACCEL_NOISE) ** 2 + errors**2
+
+
+def knocks(interval: ImuInterval) -> Array:
+    """1 sigma (K - 1,) of the mean force of each step [m/s^2] by knocks; 0 without one.
+
+    The peak of a knock is between the samples, or beyond the range of the accelerometer.
+    """
+    forces = interval.forces
+    jumps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    sizes = np.linalg.norm(forces, axis=1)
+    is_knock = jumps > _KNOCK
+    sigmas = np.zeros(len(jumps))
+    for k in np.flatnonzero(is_knock):
+        around = slice(max(k - _AROUND_KNOCK, 0), k + _AROUND_KNOCK + 1)
+        peak = max(jumps[k], sizes[k], sizes[k + 1])
+        sigmas[around] = np.maximum(sigmas[around], peak)
+    return sigmas
+
+
+def imu_factor(
+    k: int,
+    pim: Any,
+    rate: Array,
+    unknown: Doubts,
+) -> Any:
+    """The samples between the keyframes k and k + 1.
+
+    `pim`: ``gtsam.PreintegratedCombinedMeasurements``; `rate` (3,): mean rate of the gyro without
+    its bias. The gyro matrix changes the rate by ``M rate``, as a change of the bias by
+    ``-M rate`` does: the residual is linear in it to 1e-6 rad.
+    """
+    keys = [X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1)]
+    inner = gtsam.CombinedImuFactor(*keys, pim)
+    common, matrix = L(0), unknown.gyro_matrix
+    by_matrix = -by_gyro_matrix(rate)
+    blocks = tuple(IMU.values())
+
+    def error(
+        _: Any,
+        values: Any,
+        jacobians: Any,
+    ) -> Array:
+        A, negative = inner.linearize(values).jacobian()
+        of_matrix = (A[:, _OF_GYRO_1] + A[:, _OF_GYRO_2]) @ by_matrix
+        if jacobians is not None:
+            for number, columns in enumerate(blocks):
+                jacobians[number] = np.asfortranarray(A[:, columns])
+            by_doubts = np.zeros((_IMU_ROWS, unknown.size), order='F')
+            by_doubts[:, matrix] = of_matrix
+            jacobians[len(blocks)] = by_doubts
+        return np.asarray(of_matrix @ values.atVector(common)[matrix] - negative)
+
+    noise = gtsam.noiseModel.Unit.Create(_IMU_ROWS)
+    return gtsam.CustomFactor(noise, [*keys, common], error)
+
+
+def changed_bias(bias: Any, change: Array) -> Any:
+    """A bias whose gyro's part is changed by (3,)."""
+    return gtsam.imuBias.ConstantBias(bias.accelerometer(), bias.gyroscope() + change)
+
+
+# -- images -----------------------------------------------------------------------------------
+
+
+def pair_factor(
+    i: int,
+    j: int,
+    pair: PublishedPair,
+    unknown: Doubts,
+    motions: tuple[Array, Array] = (np.zeros((2, 3)), np.zeros((2, 3))),
+    sigma: float = 1.0,
+    *,
+    robust: bool = False,
+) -> Any:
+    """The images of a pair against two bodies; `motions`: their rates and specific forces.
+
+    A loop has no motions: it has no velocities, the only ones that depend on the rates.
+    """
+    keys = [X(i), V(i), X(j), V(j), L(0)]
+    residuals = _PairResiduals(keys, pair, unknown, motions)
+    noise = diagonal([sigma] * residuals.rows)
+    if robust:
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(loop_bound(residuals.rows))
+        noise = gtsam.noiseModel.Robust.Create(huber, noise)
+    return gtsam.CustomFactor(noise, keys, residuals.error)
+
+
+class _PairResiduals:
+    """Residuals of a pair at the values of a graph, and their derivatives by each key.
+
+    The optimiser asks several times at the same values: the last answer is remembered.
+    """
+
+    def __init__(
+        self,
+        keys: list[int],
+        pair: PublishedPair,
+        unknown: Doubts,
+        motions: tuple[Array, Array],
+    ) -> None:
+        images = pair.images
+        assert images is not None
+        self._keys, self._unknown, self._motions = keys, unknown, motions
+        self._root, self._offset = square_root(images.information, images.gradient)
+        self._measured = Measured.of(pair)
+        self.rows, self._size = self._root.shape
+        # The estimate of the images moves with the deviations, too.
+        self._by_images = np.zeros((self._size, len(unknown.active)))
+        if images.by_deviation is not None:
+            self._by_images = images.by_deviation[:, unknown.active]
+        self._at = np.zeros(0)
+        self._residual = np.zeros(0)
+        self._derivatives: list[Array] = []
+
+    def error(
+        self,
+        _: Any,
+        values: Any,
+        jacobians: Any,
+    ) -> Array:
+        """The residual in its sigmas, as gtsam asks for it."""
+        x1, v1, x2, v2, common = self._keys
+        pose1, pose2 = values.atPose3(x1).matrix(), values.atPose3(x2).matrix()
+        velocity1, velocity2 = values.atVector(v1), values.atVector(v2)
+        d = values.atVector(common)
+        at = np.concatenate([pose1.ravel(), pose2.ravel(), velocity1, velocity2, d])
+        if not np.array_equal(at, self._at):
+            rates, forces = self._motions
+            first = Body.of(pose1, velocity1, rates[0], forces[0])
+            second = Body.of(pose2, velocity2, rates[1], forces[1])
+            self._evaluate(first, second, d)
+            self._at = at
+        if jacobians is not None:
+            for block, derivative in enumerate(self._derivatives):
+                jacobians[block] = derivative
+        return self._residual
+
+    def _evaluate(self, first: Body, second: Body, d: Array) -> None:
+        """Remember residual and derivatives at two bodies and the vector of `doubts`."""
+        unknown, n = self._unknown, self._size
+        axes, delay = unknown.mount(d)
+        mount = Mount(unknown.R_cam_body_configured, d[doubts.ARM].copy(), axes, delay)
+        all_errors, all_by = deviations(first, second, mount, self._measured)
+        errors = all_errors[:n] - self._by_images @ d[unknown.images]
+        by = all_by[:n]
+        whole = (by.T @ self._root.T).T  # column-major, as gtsam requires
+        by_others = by[:, COLUMNS['mount']] @ unknown.by_mount - self._by_images
+        by_doubts = np.zeros((self.rows, unknown.size), order='F')
+        by_doubts[:, doubts.ARM] = whole[:, COLUMNS['arm']]
+        by_doubts[:, unknown.images] = self._root @ by_others
+        self._derivatives = [*(whole[:, columns] for columns in _OF_BODIES), by_doubts]
+        self._residual = self._root @ errors + self._offset
+
+
+def still_factor(
+    i: int,
+    j: int,
+    sigma: float,
+    unknown: Doubts,
+) -> Any:
+    """The camera keeps its position under any rotation of the body; 1 sigma per axis [m]."""
+
+    def error(
+        factor: Any,
+        values: Any,
+        jacobians: Any,
+    ) -> Array:
+        first, second, common = factor.keys()
+        pose1, pose2 = values.atPose3(first), values.atPose3(second)
+        R1, R2 = pose1.rotation().matrix(), pose2.rotation().matrix()
+        arm = values.atVector(common)[doubts.ARM]
+        if jacobians is not None:
+            across = skew(arm)
+            jacobians[0] = np.asfortranarray(np.hstack([R1 @ across, -R1]))
+            jacobians[1] = np.asfortranarray(np.hstack([-R2 @ across, R2]))
+            by_doubts = np.zeros((3, unknown.size), order='F')
+            by_doubts[:, doubts.ARM] = R2 - R1
+            jacobians[2] = by_doubts
+        before = pose1.translation() + R1 @ arm
+        after = pose2.translation() + R2 @ arm
+        return np.asarray(after - before)
+
+    return gtsam.CustomFactor(diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
+
+
+def loop_bound(dimension: int) -> float:
+    """Largest normalised residual of a loop."""
+    # The quantile of chi squared; scipy.stats takes a second to import.
+    return math.sqrt(2.0 * gammaincinv(0.5 * dimension, _LOOP_QUANTILE))
+
+
+# -- priors -----------------------------------------------------------------------------------
+
+
+def joint_prior(start: Any, covariance: Array) -> Any:
+    """All unknowns of keyframe 0 and `doubts`, given together; `start`: ``gtsam.Values``."""
+    pose, bias = start.atPose3(X(0)), start.atConstantBias(B(0))
+    velocity, d = start.atVector(V(0)), start.atVector(L(0))
+    identity = np.eye(len(covariance))
+    ends = np.cumsum([6, 3, 6, len(d)])
+    blocks = [np.asfortranarray(one) for one in np.split(identity, ends[:-1], axis=1)]
+
+    def error(
+        _: Any,
+        values: Any,
+        jacobians: Any,
+    ) -> Array:
+        if jacobians is not None:
+            for number, block in enumerate(blocks):
+                jacobians[number] = block
+        now = values.atConstantBias(B(0))
+        return np.concatenate(
+            [
+                pose.localCoordinates(values.atPose3(X(0))),
+                values.atVector(V(0)) - velocity,
+                now.vector() - bias.vector(),
+                values.atVector(L(0)) - d,
+            ]
+        )
+
+    return gtsam.CustomFactor(gaussian(covariance), [X(0), V(0), B(0), L(0)], error)
+
+
+def gaussian(covariance: Array) -> Any:
+    """Noise of a covariance."""
+    return gtsam.noiseModel.Gaussian.Covariance(np.ascontiguousarray(covariance))
+
+
+def diagonal(sigmas: Any) -> Any:
+    """Noise of independent sigmas."""
+    return gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
