@@ -19,8 +19,9 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # A reader keeps this many folders and modules apart; a larger number needs its reason in the
 # commit that raises it. [chosen: 105 modules in 15 folders were found without a map;
-# since then own readers of bag files and nine formats of recordings have modules, one a purpose]
-MOST_MODULES = 142
+# since then own readers of bag files and nine formats of recordings have modules, one a
+# purpose, and the odometry has noise, factors, starts and publication in modules of their own]
+MOST_MODULES = 148
 MOST_FOLDERS = 17
 # A module below this length that only one other imports belongs into that one.
 # [chosen: any value in 60..100 finds the same modules]

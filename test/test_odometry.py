@@ -52,6 +52,7 @@ from rs_relpose_ros.odometry.pair import (
     Mount,
     without_far_velocities,
 )
+from rs_relpose_ros.odometry.publication import Stamp
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Notice, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -341,11 +342,11 @@ def test_nothing_is_published_before_the_scale_is_known():
 
 def test_slow_motion_is_no_known_scale():
     """2 cm/s of 5 cm/s are not 2 %; 1 sigma of 0.02 m/s along z, 0.01 m/s across."""
-    variances = np.diag([1e-6] * 6 + [1e-4, 1e-4, 4e-4] + [1e-4] * 9)
+    variances = np.diag([1e-6] * 6 + [1e-4, 1e-4, 4e-4] + [1e-4] * 15)
     for speed, expected in ((0.05, 0.2), (0.4, 0.05)):
         zero = np.zeros(3)
         state = KeyframeState(
-            np.eye(3), zero, np.array([0.0, 0.0, speed]), zero, zero, zero, variances
+            np.eye(3), zero, np.array([0.0, 0.0, speed]), zero, zero, np.zeros(9), variances
         )
         graph = KeyframeGraph(state, Doubts(PARAMETERS), PARAMETERS)
         assert graph.scale_sigma() == pytest.approx(expected, rel=1e-6)
@@ -511,14 +512,14 @@ def test_covariances_of_the_base_are_those_of_samples(of_base):
     noiseless._first_R = estimator._first_R
     state = run_.graph.newest
     # Lever arms and rates are uncertain enough that every term counts.
-    P = state.covariance + np.diag([0.0] * 12 + [1e-2**2] * 3 + [0.02**2] * 3)
+    P = state.covariance + np.diag([0.0] * 12 + [1e-2**2] * 3 + [0.02**2] * 9)
 
     def odometry(state):
-        return noiseless._odometry(run_, state, rate, 0, 0)
+        return noiseless._publication(run_).state(state, rate, Stamp(0, 0, 0, 0))
 
     published = odometry(replace(state, covariance=P))
     poses, twists = [], []
-    for d in np.random.default_rng(5).multivariate_normal(np.zeros(18), P, 4000):
+    for d in np.random.default_rng(5).multivariate_normal(np.zeros(24), P, 4000):
         one = odometry(
             replace(
                 state,
@@ -1186,7 +1187,7 @@ def wrong_by_one_sigma(given, name, sigma):
     'name, sigma, true', [('time_offset', 5e-3, [5e-3]), ('axes', 7e-3, TURN.tolist())]
 )
 def test_states_hold_where_the_configuration_is_off_by_its_sigma(walked, name, sigma, true):
-    """Offset or axes are unknowns of the graph; without a sigma pairs contradict the IMU."""
+    """Offset or axes are unknowns of the graph; without a sigma the path is worse."""
     errors, contradicting = [], []
     for known in (0.0, sigma):
         pairs, parameters = wrong_by_one_sigma(walked, name, known)
@@ -1195,8 +1196,9 @@ def test_states_hold_where_the_configuration_is_off_by_its_sigma(walked, name, s
         )
         errors.append(path_of(out, walked.truth).errors)
         contradicting.append(estimator.counts['contradicting'])
-    assert contradicting[0] > 5 and contradicting[1] == estimator.counts['lost'] == 0
-    assert errors[1].ate_m < 0.5 * errors[0].ate_m
+    assert contradicting[0] >= contradicting[1] == estimator.counts['lost'] == 0
+    # Without a sigma the noise that innovations show covers a part of the error.
+    assert errors[1].ate_m < 0.75 * errors[0].ate_m
     assert abs(errors[1].scale_error) < 0.01
     values, sigmas = map(np.array, estimator.deviations[name])
     assert (sigmas < 0.7 * sigma).all()
@@ -1207,5 +1209,136 @@ def test_states_hold_where_the_configuration_is_off_by_its_sigma(walked, name, s
     assert max(found['nees'].values()) < 1.0
 
 
-def test_without_sigmas_nothing_but_the_lever_arm_is_unknown(tracked):
-    assert tracked[0].deviations == {}
+def test_without_sigmas_lever_arm_and_gyro_matrix_are_unknown(tracked):
+    deviations = tracked[0].deviations
+    assert list(deviations) == ['gyro_scale', 'gyro_skew']
+    for values, sigmas in deviations.values():
+        assert (np.abs(values) < 3.0 * np.array(sigmas)).all()
+
+
+def measured_by(gyro, given, accel=lambda forces: forces):
+    """Samples whose rates (N, 3) and forces are functions of the true ones."""
+    rates = gyro(np.array([sample.angular_velocity for sample in given.samples]))
+    forces = accel(np.array([sample.linear_acceleration for sample in given.samples]))
+    return [
+        replace(sample, angular_velocity=tuple(rate), linear_acceleration=tuple(force))
+        for sample, rate, force in zip(given.samples, rates, forces, strict=True)
+    ]
+
+
+def test_scale_and_skew_of_the_gyro_are_found(walked):
+    """Rates of a gyro whose axes have 1.5 and -1 % of scale and 0.3 deg of skew."""
+    true = np.diag([0.015, -0.01, 0.0]) + 0.005 * np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    wrong = np.linalg.inv(np.eye(3) + true)
+    samples = measured_by(lambda rates: rates @ wrong.T, walked)
+    estimator, out = run(walked, samples=samples)
+    scale, scale_sigma = map(np.array, estimator.deviations['gyro_scale'])
+    skew, skew_sigma = map(np.array, estimator.deviations['gyro_skew'])
+    assert (np.abs(scale - np.diag(true)) < 3.0 * scale_sigma).all()
+    assert (np.abs(skew - [0.0, 0.0, 0.005]) < 3.0 * skew_sigma).all()
+    assert (scale_sigma < 0.002).all()
+    found = consistency(out, estimator.smoothed()[0], walked.truth)
+    assert max(found['beyond'].values()) == 0.0
+
+
+def test_noise_of_the_imu_is_that_of_the_innovations(walked):
+    """Ten times the configured noise: named, and states within their covariance."""
+    rng = np.random.default_rng(2)
+    shape = len(walked.samples), 3
+    samples = measured_by(
+        lambda rates: rates + 0.024 * rng.standard_normal(shape),
+        walked,
+        lambda forces: forces + 0.28 * rng.standard_normal(shape),
+    )
+    estimator, out = run(walked, samples=samples)
+    found = {finding.code: finding for finding in estimator.findings}
+    gyro = found[Code.GYRO_NOISE]
+    assert gyro.estimate == pytest.approx(0.024 / math.sqrt(200.0), rel=1.0)
+    assert list(gyro.settings) == ['gyro_noise_density']
+    beyond = consistency(out, estimator.smoothed()[0], walked.truth)['beyond']
+    assert max(beyond.values()) <= 0.05
+
+
+def test_right_sensors_are_not_named(tracked):
+    assert tracked[0].findings == ()
+
+
+def test_a_knock_is_bridged_and_named(walked):
+    """At rest: 20 g for 15 ms, of which the accelerometer measures 8 g."""
+    at = np.array([seconds_of(sample.stamp_ns) for sample in walked.samples])
+    hit = (at > 3.7) & (at < 3.715)
+
+    def accel(forces):
+        return np.clip(forces + np.where(hit[:, None], [0.0, 0.0, 196.0], 0.0), -78.0, 78.0)
+
+    samples = measured_by(lambda rates: rates, walked, accel)
+    estimator, out = run(walked, samples=samples)
+    [knock] = estimator.findings
+    assert knock.code is Code.KNOCK
+    assert estimator.counts['knocks'] == 1
+    beyond = consistency(out, estimator.smoothed()[0], walked.truth)['beyond']
+    assert max(beyond.values()) == 0.0
+
+
+def test_images_at_rest_alone_do_not_stop_a_camera_that_walks(walked):
+    """Rotations without translation of an object that fills the view, while the IMU moves."""
+    still = [
+        replace(
+            pair,
+            status='PURE_ROTATION',
+            images=replace(
+                pair.images,
+                t=np.full(3, np.nan),
+                velocities=np.full(6, np.nan),
+                information=pair.images.information[:3, :3],
+                gradient=np.zeros(3),
+            ),
+        )
+        if 7.0 < seconds_of(pair.reference_imu_ns) < 8.5
+        else pair
+        for pair in walked.pairs
+    ]
+    estimator, out = run(walked, pairs=still)
+    found = consistency(out, estimator.smoothed()[0], walked.truth)
+    assert max(found['beyond'].values()) == 0.0
+    assert ate(out, walked.truth) < 0.08
+
+
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'accel_bias_walk': 1e-9},
+        {'gyro_bias_walk': 1e-9},
+        {'gyro_noise_density': 1e-7},
+        {'gyro_bias_sigma': 0.0},
+        {
+            'accel_bias_walk': 1e-9,
+            'gyro_bias_walk': 1e-9,
+            'gyro_noise_density': 1e-7,
+            'accel_noise_density': 1e-6,
+            'imu_position_sigma': 0.0,
+        },
+    ],
+)
+def test_any_legal_noise_parameter_gives_a_path(walked, values):
+    parameters = PARAMETERS.updated(values)
+    estimator, out = run(
+        walked, pairs=walked.pairs[:40], estimator=OdometryEstimator(parameters, keep=True)
+    )
+    assert estimator.counts['unsolved'] == 0
+    assert len(out) > 30
+    assert len(estimator.smoothed()) >= len(out)
+    assert ate(out, walked.truth) < 0.05
+
+
+def test_a_graph_that_is_never_solved_is_the_blocking_reason(walked, monkeypatch):
+    class Singular(gtsam.BatchFixedLagSmoother):
+        def update(self, *_):
+            raise RuntimeError('\nIndeterminant linear system\nwhile working near x5')
+
+    monkeypatch.setattr(gtsam, 'BatchFixedLagSmoother', Singular)
+    estimator, out = run(walked, pairs=walked.pairs[:10])
+    assert out == []
+    assert estimator.blocking_reason.startswith(
+        'the graph cannot be solved: Indeterminant linear system; check the sigmas'
+    )

@@ -321,10 +321,32 @@ def _static_region(finding: Finding) -> Text:
     )
 
 
+def _noise_of_imu(finding: Finding) -> Text:
+    (parameter, value) = next(iter(finding.settings.items()))
+    assert finding.estimate is not None and finding.active is not None
+    return Text(
+        f'pairs show {finding.estimate:.2g} +- {finding.sigma:.1g} {finding.unit}, configured '
+        f'{finding.active:.2g}: vibration, held samples, or a wrong scale; used as it shows',
+        f'set {parameter}: {value:g} if it is always so, or mount the IMU softly',
+    )
+
+
+def _knock(finding: Finding) -> Text:
+    measured = finding.evidence.measured
+    return Text(
+        f'the specific force jumps by {finding.estimate:.0f} m/s^2 between two samples '
+        f'({measured["knocks"]} so far): its effect on the velocity is not known',
+        'nothing has to be done if the device was put down or hit',
+    )
+
+
 # Texts of single causes, which come before the texts of `_BY_WHY`.
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,
+    (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
+    (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
+    (Code.KNOCK, Why.OFF): _knock,
     (Code.READOUT_DIRECTION, Why.OFF): _direction_off,
     (Code.READOUT_DIRECTION, Why.BY_CALIBRATION): _direction_by_calibration,
     (Code.GYRO_UNIT, Why.GROSS): _other_unit,

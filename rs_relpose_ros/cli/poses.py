@@ -282,6 +282,9 @@ def _odometry(args: argparse.Namespace) -> int:
             )
     if not outcome.live:
         return FAILED
+    if outcome.unsolved:
+        print(f'no smoothed path: {outcome.unsolved} of its graphs could not be solved')
+        return FAILED
     print(
         f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
         f'{offline.PICTURE}, {SUMMARY_FILE}'
@@ -298,7 +301,8 @@ ODOMETRY = Command(
     'live, with velocity and covariance), trajectory_rows.npz (poses at any time, RowTrajectory '
     'in Python), tracks.npz (for export), summary.json and a picture; with errors, NEES and the '
     'share of states beyond 99.7 % if the bag contains ground truth of the camera. The parameter '
-    'imu_position should be configured. Exit code 1: odometry did not start.',
+    'imu_position should be configured. Exit code 1: odometry did not start, or a graph could not '
+    'be solved.',
     options.declared(
         {
             **options.of_run('odometry'),

@@ -11,6 +11,8 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
@@ -66,6 +68,8 @@ _COUNTS = (
     'dropped',
     'lost',
     'calibration contradicted',
+    'knocks',
+    'unsolved',
 )
 # What --help prints. [derived: the topics and services below]
 _DESCRIPTION = (
@@ -367,6 +371,7 @@ class OdometryNode(StoppableNode):
         for name, (deviation, sigma) in estimator.deviations.items():
             values[f'{name}_deviation'] = _numbers(deviation, '.3g')
             values[f'{name}_deviation_sigma'] = _numbers(sigma, '.3g')
+        values['findings'] = findings_text.message_json(Assessment(estimator.findings))
         if estimator.starts:
             started = estimator.starts[-1]
             values['started'] = 'at rest' if started.at_rest else 'in motion'

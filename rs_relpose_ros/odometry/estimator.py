@@ -6,18 +6,16 @@ arrival within `_LATE_NS`.
 
 from collections import Counter, deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from rs_relpose_ros.calibration import findings_text
-from rs_relpose_ros.calibration.findings import Code
+from rs_relpose_ros.calibration.findings import Code, Finding
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import exp_so3, heading, skew, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import StuckGyro
@@ -25,23 +23,30 @@ from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.messages.streams import SensorRate
 from rs_relpose_ros.odometry.doubts import Doubts, UNKNOWN_ARM
 from rs_relpose_ros.odometry.graph import (
-    ARM,
-    BIAS,
     DOUBTS,
     GraphError,
-    GYRO_BIAS,
     KeyframeGraph,
     KeyframeState,
     Loop,
-    POSE,
-    VELOCITY,
 )
+from rs_relpose_ros.odometry.noise import knock_finding, knock_peak
 from rs_relpose_ros.odometry.pair import (
     as_loop,
     contradiction,
     later,
     row_ns,
     without_far_velocities,
+)
+from rs_relpose_ros.odometry.publication import Publication, Stamp
+from rs_relpose_ros.odometry.starts import (
+    continued,
+    end_of,
+    end_without_samples,
+    LONGEST_PROPAGATED,
+    PathEnd,
+    place_variances,
+    start_state,
+    Surroundings,
 )
 from rs_relpose_ros.odometry.states import (
     Base,
@@ -87,25 +92,6 @@ _SAME_NS = 1_000_000
 # Samples that determine gravity at a start [s]. Longer ones average over the acceleration of a
 # hand, and the gyro integrates for longer. [chosen: 0.5 to 2 s: about a step of a walk]
 _GRAVITY_WINDOW = 1.0
-# 1 sigma of that direction for a moving body [rad]: 1 m/s^2 of mean acceleration.
-# [derived: hand-held accelerations are 0.3 to 3 m/s^2 rms, averaged over a second]
-_MOVING_TILT = 0.1
-# Least 1 sigma of the accelerometer's bias [m/s^2]: factory calibration leaves 0.2 to 0.4.
-# [measured: docs/lab/odometry.md, "Starts", bias]
-_ACCEL_BIAS = 0.3
-# 1 sigma of the velocity at a start at rest [m/s], per axis. [chosen: 5 to 20 mm/s: images are at
-# rest within half a pixel]
-_REST_VELOCITY = 0.01
-# 1 sigma of the velocity at a start in motion [m/s], per axis: no information. [chosen: 2 to 10]
-_ANY_VELOCITY = 3.0
-# 1 sigma of heading and position at a start [rad, m]: they are the origin of the world.
-# [chosen: 1e-5 to 1e-3: small against all errors, large enough for the linear algebra]
-_GAUGE_SIGMA = 1e-4
-# Largest 1 sigma of the logarithm of a baseline that starts a graph; a less certain one is a worse
-# first guess than `_GUESSED_SPEED`. [chosen: 0.4 to 1: a factor of two]
-_START_LOG_SIGMA = 0.7
-# Initial speed without a baseline [m/s]: pairs of a global shutter have none. [derived: a walk]
-_GUESSED_SPEED = 1.0
 # Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist, and
 # loops share images. With less, states are beyond their covariances: with 1.8 are 19 % of the
 # positions of a phone. [measured: docs/lab/odometry.md, "Pairs in a row", "Noise by innovations"]
@@ -131,38 +117,18 @@ _CONTRADICTION = (
     'pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
     'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?'
 )
-# Longest propagation of a lost path by the IMU [s]: later its error is larger than a room.
-# [chosen: 5 to 20 s would do]
-_LONGEST_PROPAGATED = 10.0
 # Longest delay of pairs or samples behind others [s]: more are two clocks. [chosen: 5 to 60 s]
 _LONGEST_DELAY = 10.0
 # Longest start [s]; then a new one begins, without the pairs that were wrong. [chosen: 5 to 15 s]
 _LONGEST_START = 8.0
+# What to do about a graph that cannot be solved.
+_UNSOLVED_FIX = (
+    'check the sigmas and noise densities of the parameter file, and report it with the recording'
+)
 _GAP = 'the IMU has a gap, or its clock jumped: see its driver'
-# 1 sigma of the acceleration [m/s^2] and of the rate [rad/s] of a body whose IMU had a gap.
-# [derived: the most that hands do, `_MOVING_TILT`]
-_UNKNOWN_ACCELERATION = 3.0
-_UNKNOWN_RATE = 1.0
-# Time for which a body has moved until the next start, if the clock was set back [s].
-# [chosen: nobody knows it: a second, as of a driver that restarts]
-_UNKNOWN_TIME = 1.0
-# Noise of a single sample of the gyro in units of its density [sqrt(Hz)].
-# [derived: bandwidth of 100 Hz]
-_RATE_NOISE = 10.0
 # Fewest pairs that determine the scale of a start in motion. [derived: velocity, tilt and bias are
 # nine unknowns, a pair has five equations; four pairs have some left to contradict]
 _LEAST_PAIRS = 4
-# Cosine of the angle from upside down within which the smallest rotation upwards is not unique.
-_UPSIDE_DOWN = -0.999
-
-
-class _PathEnd(NamedTuple):
-    """End of a path: rotation of the body (None: any heading), position [m], sigmas."""
-
-    R: Array | None
-    position: Array
-    heading_sigma: float
-    position_sigma: float
 
 
 @dataclass(slots=True, eq=False)
@@ -170,7 +136,8 @@ class _Run:
     """A graph since its start."""
 
     graph: KeyframeGraph
-    path_end: _PathEnd  # of the path before
+    path_end: PathEnd  # of the path before
+    continued: bool  # whether it starts at the propagated end of the path before
     at_rest: bool
     first_ns: int
     observed_ns: int  # of the newest pair that was used
@@ -227,6 +194,7 @@ class OdometryEstimator:
         self._waiting: dict[int, PublishedPair] = {}
         self._run: _Run | None = None
         self._last_run: _Run | None = None  # its end is the start of the next path
+        self._end_is_known = False  # whether that end holds, propagated by the IMU
         self._runs: list[_Run] = []
         self._last_ns: int | None = None
         self._wrong_starts = 0  # since the last right one in motion
@@ -246,6 +214,8 @@ class OdometryEstimator:
         self.starts: list[StartReport] = []
         # Numbers of pairs and runs by outcome.
         self.counts: Counter[str] = Counter()
+        self._findings: dict[Code, Finding] = {}
+        self._unsolved = ''  # why the last start could not be solved
         self._warnings: list[Notice] = []
         if not self._doubts.arm_is_known:
             text = (
@@ -275,9 +245,16 @@ class OdometryEstimator:
             )
         if self.state is not OdometryState.STARTING:
             return ''
+        if self._unsolved:
+            return f'{self._unsolved}; {_UNSOLVED_FIX}'
         return self._samples.fault or (
             _CONTRADICTION if self._wrong_starts >= _WRONG_STARTS else ''
         )
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What pairs and samples show of the IMU: noises above the configured ones, knocks."""
+        return tuple(self._findings.values())
 
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
@@ -297,12 +274,12 @@ class OdometryEstimator:
         if sample.stamp_ns < self._watched_ns + _WATCH_NS:
             return
         self._watched_ns = sample.stamp_ns
-        kept = max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY
+        kept = max(LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY
         self._samples.prune(sample.stamp_ns - to_nanoseconds(kept))
         try:
             self._watch(sample.stamp_ns)
         except GraphError as error:
-            self._end(str(error), sample.stamp_ns)
+            self._fail(error, sample.stamp_ns)
 
     def _watch_rate(self, sample: ImuSample) -> None:
         """Find out whether the driver multiplies samples, whose noise is then larger."""
@@ -392,7 +369,7 @@ class OdometryEstimator:
                 found = self._process(pair)
             except GraphError as error:
                 found = None
-                self._end(str(error), pair.current_imu_ns)
+                self._fail(error, pair.current_imu_ns)
             if found is not None:
                 out.append(found)
             most = None if most is None else most - 1
@@ -408,7 +385,9 @@ class OdometryEstimator:
             return None
         stamp_ns = run.stamps[-1][0] + imu_ns - run.newest_ns
         state = run.graph.propagated(interval)
-        return self._odometry(run, state, interval.rates[-1], stamp_ns, imu_ns)
+        return self._publication(run).state(
+            state, interval.rates[-1], self._stamp(run, stamp_ns, imu_ns)
+        )
 
     def smoothed(self) -> list[Odometry]:
         """All keyframes, given all measurements; needs `keep`."""
@@ -424,14 +403,16 @@ class OdometryEstimator:
             try:
                 states = run.graph.smoothed()
             except GraphError as error:
-                self._warnings.append(
-                    Notice(f'not smoothed: {len(run.stamps)} keyframes: {error}')
-                )
+                self.counts['not smoothed'] += 1
+                text = f'not smoothed: {len(run.stamps)} keyframes: {error}; {_UNSOLVED_FIX}'
+                self._warnings.append(Notice(text))
                 continue
+            publication = self._publication(run)
             unknown_rate = np.full(3, math.nan)
             path = []
             for state, stamps in zip(states, run.stamps, strict=True):
-                path.append((state, self._odometry(run, state, unknown_rate, *stamps)))
+                stamp = self._stamp(run, *stamps)
+                path.append((state, publication.state(state, unknown_rate, stamp)))
             out.append(path)
         return out
 
@@ -496,8 +477,8 @@ class OdometryEstimator:
         if self._run is None or not (run.published or self._known(run)):
             return None
         self._corrections += 1
-        state, rate = run.graph.newest, interval.rates[-1]
-        return self._odometry(run, state, rate, pair.stamp_ns, pair.current_imu_ns)
+        stamp = self._stamp(run, pair.stamp_ns, pair.current_imu_ns)
+        return self._publication(run).state(run.graph.newest, interval.rates[-1], stamp)
 
     def _is_contradicted(self, pair: PublishedPair) -> bool:
         """Whether a finding on the calibration ends the path."""
@@ -528,12 +509,13 @@ class OdometryEstimator:
         recent = [one for when, one, _ in run.recent if when > at_ns - _RECENT_NS]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
         # The gyro predicts a rotation before the scale is known.
-        gated = run.published or pair.is_pure_rotation
+        gated = run.published or run.continued or pair.is_pure_rotation
         gate = inflation * _CONTRADICTING if gated else math.inf
         at_rest = pair.is_pure_rotation and interval.at_rest
         innovation = run.graph.add(
             interval, pair, at_rest, inflation=_SHARED * inflation, gate=gate
         )
+        self._find(run, interval, at_ns)
         run.stamps.append((pair.stamp_ns, at_ns))
         run.recent.append((at_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
@@ -543,7 +525,7 @@ class OdometryEstimator:
         run.observed_ns, run.pairs = at_ns, run.pairs + 1
         run.largest = max(run.largest, innovation)
         run.confirmed += run.published and pair.has_direction
-        run.variances = _variances(run.graph.newest)
+        run.variances = place_variances(run.graph.newest)
         if run.published:
             self._change(OdometryState.TRACKING, '', at_ns)
 
@@ -556,13 +538,16 @@ class OdometryEstimator:
         self.counts['contradicting'] += 1
         self._unusable_ns = pair.current_imu_ns
         run.contradicting += 1
-        if not run.published:
+        if run.continued and not run.published:
+            if run.contradicting == _WRONG_STARTS:
+                self._forget_end()
+        elif not run.published:
             self._count_wrong_start()
         elif not run.confirmed and run.contradicting == _WRONG_STARTS:
             self._wrong_starts = _WRONG_STARTS
             self._end(_CONTRADICTION, pair.current_imu_ns)
         elif seconds_between(run.observed_ns, pair.current_imu_ns) > self._config.max_coast:
-            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_imu_ns)
+            self._end(self._coasted, pair.current_imu_ns)
 
     def _continued(self, pair: PublishedPair) -> _Run | None:
         """The run with a keyframe at the pair's reference; None if it has ended."""
@@ -570,7 +555,7 @@ class OdometryEstimator:
         if run is None or abs(run.newest_ns - pair.reference_imu_ns) < _SAME_NS:
             return run
         if seconds_between(run.observed_ns, pair.reference_imu_ns) > self._config.max_coast:
-            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.reference_imu_ns)
+            self._end(self._coasted, pair.reference_imu_ns, known=True)
             return None
         interval = self._samples.between(run.newest_ns, pair.reference_imu_ns)
         if interval is None:
@@ -602,16 +587,16 @@ class OdometryEstimator:
         if interval is None or any(due_ns <= imu_ns for due_ns in self._waiting):
             return
         if age > self._config.max_coast:
-            self._end(f'no usable pair for {self._config.max_coast:g} s', imu_ns)
+            self._end(self._coasted, imu_ns, known=True)
             return
-        now = _variances(run.graph.propagated(interval))
+        now = place_variances(run.graph.propagated(interval))
         position, heading = (
             math.sqrt(max(new - old, 0.0)) for new, old in zip(now, run.variances, strict=True)
         )
         if position > self._config.max_position_sigma:
-            self._end(f'the position is known to {position:.2f} m', imu_ns)
+            self._end(f'the position is known to {position:.2f} m', imu_ns, known=True)
         elif heading > self._config.max_heading_sigma:
-            self._end(f'the heading is known to {heading:.2f} rad', imu_ns)
+            self._end(f'the heading is known to {heading:.2f} rad', imu_ns, known=True)
 
     def _due(
         self,
@@ -640,9 +625,15 @@ class OdometryEstimator:
         possible = self._wrong_starts < _WRONG_STARTS if at_rest else pair.has_direction
         if not possible:
             return None
-        path_end = self._path_end_at(pair.reference_imu_ns)
-        start = self._start(pair, interval, path_end, at_rest)
-        graph = KeyframeGraph(start, self._doubts, self._parameters, keep=self._keep)
+        path_end, end = self._path_end_at(pair.reference_imu_ns)
+        start = end if end is not None else self._start(pair, interval, path_end, at_rest)
+        graph = KeyframeGraph(
+            start,
+            self._doubts,
+            self._parameters,
+            continued=end is not None,
+            keep=self._keep,
+        )
         graph.use_sensor_rate(self._sensor_rate.factor, self._sensor_rate.between)
         self._first_R = start.R if self._first_R is None else self._first_R
         offset = pair.current_imu_ns - pair.stamp_ns
@@ -650,6 +641,7 @@ class OdometryEstimator:
         return _Run(
             graph=graph,
             path_end=path_end,
+            continued=end is not None,
             at_rest=at_rest,
             first_ns=pair.reference_imu_ns,
             observed_ns=pair.reference_imu_ns,
@@ -661,80 +653,42 @@ class OdometryEstimator:
         self,
         pair: PublishedPair,
         interval: ImuInterval,
-        path_end: _PathEnd,
+        path_end: PathEnd,
         at_rest: bool,
     ) -> KeyframeState:
         """The body at the pair's reference, with the covariance of a start."""
-        assert self.base is not None and pair.images is not None
-        bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
+        assert self.base is not None
         before = self._samples.up_to(pair.reference_imu_ns, _GRAVITY_WINDOW)
-        if at_rest or before is None or before.duration < interval.duration:
-            # Rotated back by the gyro over the interval.
-            back = ImuInterval(interval.seconds, -interval.rates[::-1], interval.forces[::-1])
-            force = back.mean_force(-bias)
-        else:
-            force = before.mean_force(bias)
-        C = self._doubts.R_cam_body(self._doubted)
-        # The base keeps its heading; without one the body does.
-        R = _levelled(force, path_end, self.base.R @ C if self.base.frame_id else np.eye(3))
-        velocity = np.zeros(3)
-        if not at_rest:
-            moving = _GUESSED_SPEED * pair.images.t
-            if pair.baseline_log_sigma < _START_LOG_SIGMA:
-                moving = pair.baseline * pair.images.velocities[:3]
-            swing = np.cross(interval.rates[0] - bias, self._doubted[:3])
-            velocity = R @ (C.T @ moving - swing)
-        of_bias = max(self._imu.accel_bias_sigma, _ACCEL_BIAS)
-        tilt = of_bias / STANDARD_GRAVITY if at_rest else _MOVING_TILT
-        size = BIAS.stop + len(self._doubted)
-        covariance = np.zeros((size, size))
-        covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _GAUGE_SIGMA])) @ R
-        covariance[3:6, 3:6] = _GAUGE_SIGMA**2 * np.eye(3)
-        of_velocity = _REST_VELOCITY if at_rest else _ANY_VELOCITY
-        covariance[VELOCITY, VELOCITY] = of_velocity**2 * np.eye(3)
-        of_biases = np.repeat([of_bias, self._imu.gyro_bias_sigma], 3)
-        covariance[BIAS, BIAS] = np.diag(np.square(of_biases))
-        covariance[DOUBTS, DOUBTS] = self._doubts_covariance
-        return KeyframeState(
-            R=R,
-            position=path_end.position,
-            velocity=velocity,
-            gyro_bias=bias,
-            accel_bias=np.zeros(3),
-            doubts=self._doubted,
-            covariance=covariance,
+        return start_state(
+            pair,
+            Surroundings(interval, before, path_end, at_rest),
+            self._doubts.R_cam_body(self._doubted),
+            (self._doubted, self._doubts_covariance),
+            self.base,
+            self._imu,
         )
 
-    def _path_end_at(self, imu_ns: int) -> _PathEnd:
-        """End of the last path, propagated by the IMU to a time."""
+    def _path_end_at(self, imu_ns: int) -> tuple[PathEnd, KeyframeState | None]:
+        """End of the last path at a time, and the state there if the next path continues from it.
+
+        A path that continues has the uncertainty of that state in its graph, and inherits the path
+        end of the path before.
+        """
         run = self._last_run
         if run is None:
-            return _PathEnd(None, np.zeros(3), 0.0, 0.0)
-        seconds, state = seconds_between(run.newest_ns, imu_ns), run.graph.newest
+            return PathEnd.origin(), None
+        seconds = seconds_between(run.newest_ns, imu_ns)
         interval = self._samples.between(run.newest_ns, imu_ns)
-        # Uncertainty of earlier losses remains.
-        earlier = run.path_end
-        moved_since = (state.position - earlier.position)[:2]
-        by_heading = earlier.heading_sigma**2 * float((moved_since**2).sum()) / 3.0
-        variance = earlier.position_sigma**2 + by_heading
-        turned = moved = 0.0
-        if interval is not None and seconds <= _LONGEST_PROPAGATED:
+        if interval is not None and seconds <= LONGEST_PROPAGATED:
             state = run.graph.propagated(interval)
-        elif abs(seconds) > _SAME_NS / NANOSECONDS:  # else the keyframe itself: no gap
-            unknown = 0.0
-            if seconds > 0.0:  # on at the same velocity
-                state = replace(state, position=state.position + seconds * state.velocity)
-            else:  # the clock was set back: for an unknown time
-                seconds = _UNKNOWN_TIME
-                unknown = seconds * float(np.linalg.norm(state.velocity))
-            turned = _UNKNOWN_RATE * seconds
-            moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2 + unknown
-            of_velocity = float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
-            variance += seconds**2 * of_velocity
-        of_position, of_heading = _variances(state)
-        heading_sigma = math.hypot(earlier.heading_sigma, math.sqrt(of_heading), turned)
-        position_sigma = math.sqrt(variance + of_position / 3.0 + moved**2)
-        return _PathEnd(state.R, state.position, min(heading_sigma, math.pi), position_sigma)
+            if self._end_is_known:
+                return run.path_end, continued(state)
+            return end_of(state, run.path_end), None
+        state = run.graph.newest
+        end = end_of(state, run.path_end)
+        if abs(seconds) > _SAME_NS / NANOSECONDS:  # else the keyframe itself: no gap
+            end = end_without_samples(end, state, seconds)
+        return end, None
 
     def _known(self, run: _Run) -> bool:
         """Whether the scale of a starting run is known."""
@@ -748,8 +702,11 @@ class OdometryEstimator:
             )
         if run.at_rest or run.pairs >= _LEAST_PAIRS:
             if max(run.graph.misfit(), run.largest / _GROSS) > _WRONG_START:
-                self._run = None
-                self._count_wrong_start()
+                if run.continued:
+                    self._forget_end()
+                else:
+                    self._run = None
+                    self._count_wrong_start()
                 return False
             if sigma < self._config.max_scale_sigma:
                 self._publish(run, StartReport(run.at_rest, run.newest_ns, seconds, sigma))
@@ -779,21 +736,43 @@ class OdometryEstimator:
             run.newest_ns,
         )
 
+    def _forget_end(self) -> None:
+        """The pairs contradict the propagated end of a path: the next start is a new one."""
+        self._run = None
+        self._end_is_known = False
+
     def _count_wrong_start(self) -> None:
         self._wrong_starts += 1
         if self._wrong_starts == _WRONG_STARTS:
             self.reason = _CONTRADICTION
 
+    def _fail(self, error: GraphError, imu_ns: int) -> None:
+        """End a run whose graph cannot be solved."""
+        self.counts['unsolved'] += 1
+        self._unsolved = str(error)
+        self._end(str(error), imu_ns)
+
+    @property
+    def _coasted(self) -> str:
+        """The reason of a path that ends without pairs."""
+        return f'no usable pair for {self._config.max_coast:g} s'
+
     def _end(
         self,
         reason: str,
         imu_ns: int,
+        *,
+        known: bool = False,
     ) -> None:
-        """End the run; the next one continues from its end."""
+        """End the run; the next one continues from its end.
+
+        `known`: whether the IMU still propagates the end within its covariance.
+        """
         run, self._run = self._run, None
         if run is not None and run.published:
             self.counts['lost'] += 1
             self._last_run = run
+            self._end_is_known = known
             newest = run.graph.newest
             self._doubted = newest.doubts
             self._doubts_covariance = newest.covariance[DOUBTS, DOUBTS]
@@ -841,103 +820,32 @@ class OdometryEstimator:
         newest = self._run.graph.newest
         return newest.doubts, newest.covariance[DOUBTS, DOUBTS]
 
-    def _odometry(
-        self,
-        run: _Run,
-        state: KeyframeState,
-        rate: Array,
-        stamp_ns: int,
-        imu_ns: int,
-    ) -> Odometry:
-        """The base, or the camera without one, of the body at a time; `rate` (3,) of the gyro."""
-        base, first_R = self.base, self._first_R
-        assert base is not None and first_R is not None
-        # The base on the body, as the camera: its rotation and position.
-        R_cam_body = self._doubts.R_cam_body(state.doubts)
-        C = base.R @ R_cam_body
-        c = state.arm - C.T @ base.position
-        rate = rate - state.gyro_bias
-        R = state.R @ C.T
-        # It is at the origin at first: p + (R - R_first) c, in the world.
-        moved = state.R - first_R
-        position = state.position + moved @ c
-        # The camera's axes turn the base about the camera: derivatives by these axes.
-        axes_on_body = -R_cam_body.T
-        arm_by_axes = axes_on_body @ skew(base.R.T @ base.position)
-        n = len(state.covariance)
-        by_axes = np.zeros((3, n))
-        of_images = self._doubts.images
-        by_axes[:, ARM.start + of_images.start : ARM.start + of_images.stop] = (
-            self._doubts.by_mount[:3]
-        )
-        to_world, to_twist = np.zeros((6, n)), np.zeros((6, n))
-        to_world[:3, :3] = -state.R @ skew(c)
-        to_world[:3, 3:6] = state.R
-        to_world[:3, ARM] = moved
-        to_world[:3] += moved @ arm_by_axes @ by_axes
-        to_world[3:, :3] = state.R
-        to_world[3:] += state.R @ axes_on_body @ by_axes
-        velocity_on_body = state.R.T @ state.velocity
-        velocity = R.T @ (state.velocity + state.R @ skew(rate) @ c)
-        to_twist[:3, :3] = C @ skew(velocity_on_body)
-        to_twist[:3, VELOCITY] = R.T
-        to_twist[:3, ARM] = C @ skew(rate)
-        to_twist[:3, GYRO_BIAS] = C @ skew(c)
-        to_twist[3:, GYRO_BIAS] = -C
-        to_twist[:3] += (C @ skew(rate) @ arm_by_axes - skew(velocity) @ base.R) @ by_axes
-        to_twist[3:] -= skew(C @ rate) @ base.R @ by_axes
-        by_rate = to_twist[:, GYRO_BIAS] * self._imu.gyro_noise_density * _RATE_NOISE
-        twist_covariance = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
-        of_body = to_world @ state.covariance @ to_world.T
-        covariance = of_body + _of_path_end(run.path_end, state.position + state.R @ c)
-        return Odometry(
-            stamp_ns=stamp_ns,
-            imu_ns=imu_ns,
-            frame_id=run.frame_id,
-            path=run.path,
-            corrections=self._corrections,
-            R=R,
-            position=position,
-            pose_covariance=covariance,
-            velocity=velocity,
-            angular_velocity=C @ rate,
-            velocity_covariance=twist_covariance,
+    def _publication(self, run: _Run) -> Publication:
+        """What the states of a run have in common."""
+        assert self.base is not None and self._first_R is not None
+        return Publication(
+            self.base,
+            run.frame_id,
+            self._first_R,
+            run.path_end,
+            self._doubts,
+            self._imu.gyro_noise_density,
         )
 
+    def _stamp(self, run: _Run, stamp_ns: int, imu_ns: int) -> Stamp:
+        """When a state of a run is."""
+        return Stamp(stamp_ns, imu_ns, run.path, self._corrections)
 
-def _of_path_end(path_end: _PathEnd, position: Array) -> Array:
-    """Covariance (6, 6) of a pose at a position (3,) by the end of the path before."""
-    up = np.array([0.0, 0.0, 1.0])
-    turned = np.concatenate([skew(up) @ (position - path_end.position), up])
-    covariance = path_end.heading_sigma**2 * np.outer(turned, turned)
-    covariance[:3, :3] += path_end.position_sigma**2 * np.eye(3)
-    return np.asarray(covariance)
+    # -- findings ----------------------------------------------------------------------------
 
-
-def _variances(state: KeyframeState) -> tuple[float, float]:
-    """Variances of the position (its length) and of the heading."""
-    up, covariance = state.R[2], state.covariance[POSE, POSE]
-    of_heading = up @ covariance[:3, :3] @ up
-    return float(np.trace(covariance[3:, 3:])), float(of_heading)
-
-
-def _levelled(
-    force: Array,
-    path_end: _PathEnd,
-    axes: Array,
-) -> Array:
-    """Rotation (3, 3) from the body to the world, by the specific force at rest.
-
-    `axes` (3, 3): from the body to the axes that keep their heading.
-    """
-    up = axes @ force / np.linalg.norm(force)
-    # The smallest rotation that takes it upwards, then one about z to the last heading.
-    if up[2] > _UPSIDE_DOWN:
-        turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
-        R = np.eye(3) + turn + turn @ turn / (1.0 + up[2])
-    else:
-        R = np.diag([1.0, -1.0, -1.0])
-    R = R @ axes
-    if path_end.R is not None:
-        R = exp_so3(heading(path_end.R @ R.T)) @ R
-    return np.asarray(R)
+    def _find(self, run: _Run, interval: ImuInterval, imu_ns: int) -> None:
+        """Name what the newest keyframe shows of the IMU, once each."""
+        found = run.graph.findings
+        peak = knock_peak(interval)
+        if peak and run.published:
+            self.counts['knocks'] += 1
+            found = (*found, knock_finding(peak, self.counts['knocks'], imu_ns))
+        for finding in found:
+            if finding.code not in self._findings:
+                self._warnings.append(Notice(findings_text.line(finding)))
+            self._findings[finding.code] = finding

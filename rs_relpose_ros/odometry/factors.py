@@ -18,7 +18,6 @@ from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
 from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import skew, STANDARD_GRAVITY
-from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry import doubts
 from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
@@ -55,15 +54,6 @@ _INTEGRATION = 1e-4
 # Share of right loops within the bound of chi squared: 1 % of them are lost.
 # [chosen: 0.95 to 0.999 would do; measured with 0.99 in docs/lab/odometry.md, "Loop closures"]
 _LOOP_QUANTILE = 0.99
-# Change of the specific force between two samples [m/s^2] from which its mean is not known: a
-# knock, whose peak lies between the samples. Steps of a walk change it by less at 50 Hz or more; a
-# smaller bound would take them for knocks, a larger one would trust a knock.
-# [chosen: 15 to 40 would do: hand-held walks reach 5, knocks 50 to 200]
-_KNOCK = 20.0
-# Samples before and after a knock that are as uncertain: it lasts for 5 to 15 ms.
-# [chosen: 1 to 3 would do at 200 Hz]
-_AROUND_KNOCK = 2
-
 # Columns of the derivatives of a pair, by the keys of the two bodies.
 _OF_BODIES = tuple(COLUMNS[key] for key in ('X1', 'V1', 'X2', 'V2'))
 # Columns of the derivatives of an IMU factor, by its keys; those of `doubts` follow.
@@ -79,8 +69,8 @@ _OF_GYRO_2 = slice(IMU['B2'].start + 3, IMU['B2'].stop)
 # -- the IMU ----------------------------------------------------------------------------------
 
 
-def preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
-    """Noise densities of the samples for gtsam; that of the accelerometer follows."""
+def preintegration(config: OdometryConfig) -> Any:
+    """Walks of the biases for gtsam; the densities of the samples follow."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(STANDARD_GRAVITY)
     eye = np.eye(3)
     gyro_walk = max(config.gyro_bias_walk, _LEAST_GYRO_WALK)
@@ -91,31 +81,14 @@ def preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
     return params
 
 
-def gyro_variance(imu: ImuConfig, errors: float) -> float:
-    """Squared density of the gyro's noise; `errors`: density beyond the configured one."""
-    return max(imu.gyro_noise_density, _LEAST_GYRO_NOISE) ** 2 + errors**2
+def gyro_variance(configured: float) -> float:
+    """Squared density of the gyro's noise with which a graph can be solved."""
+    return max(configured, _LEAST_GYRO_NOISE**2)
 
 
-def accel_variance(imu: ImuConfig, errors: float) -> float:
+def accel_variance(imu: ImuConfig) -> float:
     """The same of the accelerometer."""
-    return max(imu.accel_noise_density, _LEAST_ACCEL_NOISE) ** 2 + errors**2
-
-
-def knocks(interval: ImuInterval) -> Array:
-    """1 sigma (K - 1,) of the mean force of each step [m/s^2] by knocks; 0 without one.
-
-    The peak of a knock is between the samples, or beyond the range of the accelerometer.
-    """
-    forces = interval.forces
-    jumps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
-    sizes = np.linalg.norm(forces, axis=1)
-    is_knock = jumps > _KNOCK
-    sigmas = np.zeros(len(jumps))
-    for k in np.flatnonzero(is_knock):
-        around = slice(max(k - _AROUND_KNOCK, 0), k + _AROUND_KNOCK + 1)
-        peak = max(jumps[k], sizes[k], sizes[k + 1])
-        sigmas[around] = np.maximum(sigmas[around], peak)
-    return sigmas
+    return max(imu.accel_noise_density, _LEAST_ACCEL_NOISE) ** 2
 
 
 def imu_factor(
@@ -130,8 +103,9 @@ def imu_factor(
     its bias. The gyro matrix changes the rate by ``M rate``, as a change of the bias by
     ``-M rate`` does: the residual is linear in it to 1e-6 rad.
     """
-    keys = [X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1)]
-    inner = gtsam.CombinedImuFactor(*keys, pim)
+    x1, v1, b1 = X(k), V(k), B(k)
+    x2, v2, b2 = X(k + 1), V(k + 1), B(k + 1)
+    inner = gtsam.CombinedImuFactor(x1, v1, x2, v2, b1, b2, pim)
     common, matrix = L(0), unknown.gyro_matrix
     by_matrix = -by_gyro_matrix(rate)
     blocks = tuple(IMU.values())
@@ -152,7 +126,7 @@ def imu_factor(
         return np.asarray(of_matrix @ values.atVector(common)[matrix] - negative)
 
     noise = gtsam.noiseModel.Unit.Create(_IMU_ROWS)
-    return gtsam.CustomFactor(noise, [*keys, common], error)
+    return gtsam.CustomFactor(noise, [x1, v1, x2, v2, b1, b2, common], error)
 
 
 def changed_bias(bias: Any, change: Array) -> Any:

@@ -18,6 +18,7 @@ import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
 
+from rs_relpose_ros.calibration.findings import Finding
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.errors import RsRelposeError
@@ -30,10 +31,10 @@ from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
 from rs_relpose_ros.odometry.noise import (
     Innovation,
     integrals_of_noise,
+    knocks,
     NoisePosterior,
     spread,
 )
-from rs_relpose_ros.pipeline.findings import Finding
 
 # 1 sigma of the velocity of a body at rest [m/s], per axis. A smaller one holds a body that
 # creeps; a larger one lets the path drift at rest. [chosen: 2 to 10 mm/s: a hand that holds still]
@@ -159,8 +160,10 @@ class KeyframeGraph:
         keep: bool = False,
     ) -> None:
         self._doubts, self._imu, self._config = unknown, parameters.imu, parameters.odometry
-        self._preintegration = factors.preintegration(self._imu, self._config)
+        self._preintegration = factors.preintegration(self._config)
         self._noise = NoisePosterior()
+        # Squared density of the gyro's noise before innovations show more.
+        self._gyro_variance = self._imu.gyro_noise_density**2
         self._step = _NO_STEP
         # Each update is one step of the optimisation, which the next keyframe continues.
         lag = self._config.smoothing_lag
@@ -198,8 +201,7 @@ class KeyframeGraph:
         The messages of one sample have one error, so that a turn has the noise of fewer samples.
         `between` [rad^2/s]: density of the errors of interpolation.
         """
-        density = factor * self._imu.gyro_noise_density**2 + between
-        self._preintegration.setGyroscopeCovariance(density * np.eye(3))
+        self._gyro_variance = factor * self._imu.gyro_noise_density**2 + between
 
     def propagated(self, interval: ImuInterval) -> KeyframeState:
         """The body after samples since the newest keyframe, without a new keyframe."""
@@ -423,14 +425,15 @@ class KeyframeGraph:
     def _integrate(self, pim: Any, interval: ImuInterval) -> None:
         """Add samples to an integral, with their noise; knocks have more."""
         eye = np.eye(3)
-        of_gyro = factors.gyro_variance(self._imu, self._noise.gyro_errors)
-        of_accel = factors.accel_variance(self._imu, self._noise.accel_errors)
+        errors = self._noise
+        of_gyro = factors.gyro_variance(self._gyro_variance) + errors.gyro_errors**2
+        of_accel = factors.accel_variance(self._imu) + errors.accel_errors**2
         self._preintegration.setGyroscopeCovariance(of_gyro * eye)
         self._preintegration.setAccelerometerCovariance(of_accel * eye)
         steps = np.diff(interval.seconds)
         forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
         rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
-        by_knocks = factors.knocks(interval) ** 2 * steps
+        by_knocks = knocks(interval) ** 2 * steps
         for force, rate, seconds, more in zip(forces, rates, steps, by_knocks, strict=True):
             if more:
                 self._preintegration.setAccelerometerCovariance((of_accel + more) * eye)

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.pipeline.findings import Code, Evidence, Finding, FindingState, Why
+from rs_relpose_ros.imu.buffer import ImuInterval
 
 # Densities [m/s^2/sqrt(Hz)] of errors of an accelerometer that its noise does not have (scale,
 # axes, vibration, clock), from which innovations choose. A shorter list could not follow a bad
@@ -43,10 +44,18 @@ _ONE_PAIR = 6.0
 _NAMED_RATIO = 2.0
 # Largest probability that the density is below that ratio. A larger one would report some right
 # sensors in an hour. [chosen: 1e-4 to 1e-2 would do, as densities are estimated for 20 s]
-_NAMED_CHANCE = 1e-3
+_NAMED_CHANCE = 1e-2
 # Innovations before which no noise is named: the prior decides until then.
 # [chosen: 10 to 50 would do: some seconds]
 _LEAST_NAMED = 20
+# Change of the specific force between two samples [m/s^2] from which its mean is not known: a
+# knock, whose peak lies between the samples. Steps of a walk change it by less at 50 Hz or more; a
+# smaller bound would take them for knocks, a larger one would trust a knock.
+# [chosen: 15 to 40 would do: hand-held walks reach 5, knocks 50 to 200]
+_KNOCK = 20.0
+# Samples before and after a knock that are as uncertain: it lasts for 5 to 15 ms.
+# [chosen: 1 to 3 would do at 200 Hz]
+_AROUND_KNOCK = 2
 
 
 class Innovation(NamedTuple):
@@ -190,4 +199,42 @@ def _noise_finding(
         unit=unit,
         evidence=Evidence(measured={'ratio': mean / configured}),
         settings={parameter: float(f'{mean:.2g}')},
+    )
+
+
+# -- knocks -----------------------------------------------------------------------------------
+
+
+def knocks(interval: ImuInterval) -> Array:
+    """1 sigma (K - 1,) of the mean force of each step [m/s^2] by knocks; 0 without one.
+
+    The peak of a knock is between the samples, or beyond the range of the accelerometer.
+    """
+    forces = interval.forces
+    jumps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    sizes = np.linalg.norm(forces, axis=1)
+    is_knock = jumps > _KNOCK
+    sigmas = np.zeros(len(jumps))
+    for k in np.flatnonzero(is_knock):
+        around = slice(max(k - _AROUND_KNOCK, 0), k + _AROUND_KNOCK + 1)
+        peak = max(jumps[k], sizes[k], sizes[k + 1])
+        sigmas[around] = np.maximum(sigmas[around], peak)
+    return sigmas
+
+
+def knock_peak(interval: ImuInterval) -> float:
+    """Largest specific force around a knock [m/s^2]; 0 without one."""
+    return float(knocks(interval).max(initial=0.0))
+
+
+def knock_finding(peak: float, number: int, imu_ns: int) -> Finding:
+    """The finding of the newest knock; `number`: of all knocks."""
+    return Finding(
+        Code.KNOCK,
+        FindingState.SUSPECT,
+        Why.OFF,
+        estimated=(peak,),
+        sigma=peak,
+        unit='m/s^2',
+        evidence=Evidence(measured={'knocks': number, 'imu_ns': imu_ns}),
     )

@@ -12,6 +12,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.calibration import findings_text
+from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
@@ -85,6 +87,7 @@ class OdometryOutcome:
     metrics: dict[str, Any]
     warnings: list[str]
     blocking_reason: str  # why it could not start
+    unsolved: int  # paths whose graph could not be solved for all keyframes
 
 
 def odometry_into(
@@ -146,7 +149,14 @@ def odometry_into(
         _write_rows(folder, row_trajectory(paths, base, parameters, given, taken), rate)
         KeyframeObservations.merged(observed).save(folder / TRACKS_FILE)
     draw_paths(drawn, folder / PICTURE)
-    return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
+    return OdometryOutcome(
+        live,
+        smoothed,
+        metrics,
+        warnings,
+        estimator.blocking_reason,
+        estimator.counts['not smoothed'],
+    )
 
 
 def _write_keyframes(path: Path, keyframes: Sequence[Odometry]) -> None:
@@ -183,7 +193,14 @@ def _with_loops(
 
 def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str, Any]:
     """Counts, intervals, starts and the estimated lever arm, for summary.json."""
-    counted = ('pairs', 'contradicting', 'late', 'without images', 'calibration contradicted')
+    counted = (
+        'pairs',
+        'contradicting',
+        'late',
+        'without images',
+        'calibration contradicted',
+        'unsolved',
+    )
     intervals: dict[str, list[dict[str, Any]]] = {
         OdometryState.UNCERTAIN.value: [],
         OdometryState.LOST.value: [],
@@ -205,6 +222,7 @@ def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str
             name: {'value': value, 'sigma': sigma}
             for name, (value, sigma) in estimator.deviations.items()
         },
+        'findings': findings_text.summary_json(Assessment(estimator.findings))['findings'],
         'starts': [asdict(started) for started in estimator.starts],
         'length_m': float(steps.sum()),
     }

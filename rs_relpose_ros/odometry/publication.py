@@ -1,0 +1,137 @@
+"""The state of the base, or of the camera without one, that follows from a state of the body."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
+from rs_relpose_ros.odometry.graph import (
+    ARM,
+    DOUBTS,
+    GYRO_BIAS,
+    KeyframeState,
+    ROTATION,
+    TRANSLATION,
+    VELOCITY,
+)
+from rs_relpose_ros.odometry.starts import PathEnd
+from rs_relpose_ros.odometry.states import Base, Odometry
+
+# Noise of a single sample of the gyro in units of its density [sqrt(Hz)]. A smaller one would make
+# published rates too certain. [derived: bandwidth of 100 Hz]
+_RATE_NOISE = 10.0
+
+
+class Stamp(NamedTuple):
+    """When and on which path a state is."""
+
+    stamp_ns: int  # on the clock of the camera
+    imu_ns: int
+    path: int  # number of earlier starts
+    corrections: int  # of the keyframe, since the first start
+
+
+class Publication(NamedTuple):
+    """What is the same for all states of a path."""
+
+    base: Base
+    frame_id: str
+    origin_axes: Array  # of the body at the first start: the origin
+    path_end: PathEnd  # of the path before
+    unknown: Doubts
+    gyro_noise_density: float
+
+    def state(self, body: KeyframeState, gyro: Array, stamp: Stamp) -> Odometry:
+        """The base at a state of the body; `gyro` (3,): the rate that it measures."""
+        base = self.base
+        R_cam_body = self.unknown.R_cam_body(body.doubts)
+        C = base.R @ R_cam_body
+        arm = body.arm - C.T @ base.position
+        unbiased = gyro - body.gyro_bias
+        by_matrix = by_gyro_matrix(unbiased)
+        rate = unbiased + by_matrix @ body.doubts[self.unknown.gyro_matrix]
+        R = body.R @ C.T
+        # It is at the origin at first: p + (R - R_first) c, in the world.
+        position = body.position + (body.R - self.origin_axes) @ arm
+        velocity = R.T @ (body.velocity + body.R @ skew(rate) @ arm)
+        to_world = self._pose_by_body(body, arm, R_cam_body)
+        to_twist = self._twist_by_body(body, arm, rate, velocity, R_cam_body)
+        place = ARM.start + self.unknown.gyro_matrix.start
+        to_twist[:, place:] -= to_twist[:, GYRO_BIAS] @ by_matrix
+        by_rate = to_twist[:, GYRO_BIAS] * self.gyro_noise_density * _RATE_NOISE
+        of_body = to_world @ body.covariance @ to_world.T
+        of_twist = to_twist @ body.covariance @ to_twist.T
+        inherited = self.path_end.of_pose(body.position + body.R @ arm)
+        return Odometry(
+            stamp_ns=stamp.stamp_ns,
+            imu_ns=stamp.imu_ns,
+            frame_id=self.frame_id,
+            path=stamp.path,
+            corrections=stamp.corrections,
+            R=R,
+            position=position,
+            pose_covariance=of_body + inherited,
+            velocity=velocity,
+            angular_velocity=C @ rate,
+            velocity_covariance=of_twist + by_rate @ by_rate.T,
+        )
+
+    def _by_axes(self, size: int) -> Array:
+        """Derivative (3, n) of the camera's axes by the unknowns of a keyframe."""
+        by_axes = np.zeros((3, size))
+        images = self.unknown.images
+        first = DOUBTS.start
+        by_axes[:, first + images.start : first + images.stop] = self.unknown.by_mount[:3]
+        return by_axes
+
+    def _pose_by_body(
+        self,
+        body: KeyframeState,
+        arm: Array,
+        R_cam_body: Array,
+    ) -> Array:
+        """Derivative (6, n) of position and rotation by the unknowns of a keyframe."""
+        n = len(body.covariance)
+        # The camera's axes turn the base about the camera: derivatives by these axes.
+        axes_on_body = -R_cam_body.T @ self._by_axes(n)
+        across = skew(self.base.R.T @ self.base.position)
+        arm_by_axes = -R_cam_body.T @ across @ self._by_axes(n)
+        moved = body.R - self.origin_axes
+        by = np.zeros((6, n))
+        by[:3, ROTATION] = -body.R @ skew(arm)
+        by[:3, TRANSLATION] = body.R
+        by[:3, ARM] = moved
+        by[:3] += moved @ arm_by_axes
+        by[3:, ROTATION] = body.R
+        by[3:] += body.R @ axes_on_body
+        return by
+
+    def _twist_by_body(
+        self,
+        body: KeyframeState,
+        arm: Array,
+        rate: Array,
+        velocity: Array,
+        R_cam_body: Array,
+    ) -> Array:
+        """Derivative (6, n) of velocity and rate of the base, in its axes."""
+        n = len(body.covariance)
+        base_R = self.base.R
+        C = base_R @ R_cam_body
+        by_axes = self._by_axes(n)
+        across = skew(base_R.T @ self.base.position)
+        arm_by_axes = -R_cam_body.T @ across @ by_axes
+        velocity_on_body = body.R.T @ body.velocity
+        by = np.zeros((6, n))
+        by[:3, ROTATION] = C @ skew(velocity_on_body)
+        by[:3, VELOCITY] = C @ body.R.T
+        by[:3, ARM] = C @ skew(rate)
+        by[:3, GYRO_BIAS] = C @ skew(arm)
+        by[3:, GYRO_BIAS] = -C
+        by[:3] += C @ skew(rate) @ arm_by_axes - skew(velocity) @ base_R @ by_axes
+        by[3:] -= skew(C @ rate) @ base_R @ by_axes
+        return by
