@@ -20,9 +20,10 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 # A reader keeps this many folders and modules apart; a larger number needs its reason in the
 # commit that raises it. [chosen: 105 modules in 15 folders were found without a map;
 # since then own readers of bag files and nine formats of recordings have modules, one a
-# purpose, and the odometry has noise, factors, starts and publication in modules of their own]
-MOST_MODULES = 148
-MOST_FOLDERS = 17
+# purpose, the odometry has noise, factors, starts and publication in modules of their own, and
+# the report is a folder, as it is made of check, replay and odometry together]
+MOST_MODULES = 154
+MOST_FOLDERS = 18
 # A module below this length that only one other imports belongs into that one.
 # [chosen: any value in 60..100 finds the same modules]
 SHORTEST_MODULE = 80

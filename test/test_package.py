@@ -219,7 +219,9 @@ MAY_IMPORT = {
     'offline': CORE | {'calibration', 'pipeline', 'messages', 'bags', 'calibrate'},
     'odometry': BASE
     | {'estimator', 'imu', 'tracking', 'calibration', 'pipeline', 'messages', 'bags', 'offline'},
-    'cli': BASE | {'messages', 'bags', 'offline', 'calibrate', 'odometry'},
+    'report': CORE
+    | {'pipeline', 'messages', 'bags', 'calibration', 'calibrate', 'offline', 'odometry'},
+    'cli': BASE | {'messages', 'bags', 'offline', 'calibrate', 'odometry', 'report'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {

@@ -18,6 +18,7 @@ PICTURE = Path(__file__).with_name('architecture.svg')
 CONTENTS = {
     'cli': 'commands',
     'nodes': 'ROS 2 nodes (rclpy)',
+    'report': 'one page about a recording',
     'offline': 'replay, check, unroll',
     'odometry': 'graph, trajectories, export (gtsam)',
     'calibrate': 'recordings, stored results',

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from rs_relpose_ros.bags.convert import how_to_convert
-from rs_relpose_ros.bags.mcap import McapStorage
+from rs_relpose_ros.bags.mcap import intact_records, McapStorage, write_records
 from rs_relpose_ros.bags.ros1 import Ros1Storage
 from rs_relpose_ros.bags.sqlite import SqliteStorage
 from rs_relpose_ros.bags.storage import (
@@ -282,3 +282,59 @@ def _unpacked(file: Path, stack: ExitStack) -> Path:
                 raise DamagedError(f'{size} bytes decompress to more than {limit}')
             out.write(block)
     return unpacked
+
+
+# -- What is intact of a damaged bag --------------------------------------------------------------
+#
+# Commands that estimate refuse a damaged bag: what is missing may be what matters. A report shows
+# the rest, and says so. Only MCAP files are copied: of others nothing is known but their damage.
+
+# First bytes of a file by which a bag is recognised. [derived: the longest of `Source`]
+_BEGIN = 16
+
+
+def _begin(file: Path) -> bytes:
+    """The first bytes of a file; none of what is no file or cannot be read."""
+    with suppress(OSError), file.open('rb') as opened:
+        return opened.read(_BEGIN)
+    return b''
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file begins as a bag does, or a folder has such a file.
+
+    A path that does not exist, and a file of another kind, are no damaged bag.
+    """
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    sources = tuple(source.value for source in Source)
+    return any(_begin(file).startswith(sources) for file in files)
+
+
+def salvaged(path: Path, folder: Path) -> Path | None:
+    """Copy the intact records of the MCAP files of a bag; None if there are no such files.
+
+    Parameters
+    ----------
+    path : Path
+        File or directory of the bag.
+    folder : Path
+        Existing, empty folder for the copy.
+
+    Returns
+    -------
+    Path or None
+        File or directory to open in place of `path`. Each chunk is in it that has its checksum
+        and whose place in the file is known: all before the first damage between two records, and
+        all behind damage inside of a chunk.
+    """
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    magic = Source.MCAP.value
+    copies = []
+    for file in (one for one in files if _begin(one).startswith(magic)):
+        copies.append((folder / file.name).with_suffix('.mcap'))
+        with file.open('rb') as source, copies[-1].open('wb') as target:
+            source.seek(len(magic))
+            write_records(target, intact_records(source))
+    if not copies:
+        return None
+    return folder if path.is_dir() else copies[0]

@@ -4,12 +4,12 @@ Records and their fields: https://mcap.dev/spec. All numbers are little-endian.
 """
 
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, suppress
 import os
 from pathlib import Path
 import struct
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 import zlib
 
 from rs_relpose_ros.bags.storage import (
@@ -17,14 +17,17 @@ from rs_relpose_ros.bags.storage import (
     DamagedError,
     Entry,
     KeptChunks,
+    MAX_CHUNK_BYTES,
     qos_profiles,
     read_exactly,
     Source,
     StoredTopic,
 )
 
-# A footer ends the file. Kinds and layouts of records are those of the specification above.
-# [derived: MCAP]
+# The first record names profile and library. Kinds and layouts of records are those of the
+# specification above. [derived: MCAP]
+_HEADER = 0x01
+# A footer ends the file. [derived: MCAP]
 _FOOTER = 0x02
 # A schema names and defines a type. [derived: MCAP]
 _SCHEMA = 0x03
@@ -207,19 +210,56 @@ class McapStorage:
 
     def _load_chunk(self, start: int) -> bytes:
         """The records of a chunk, decompressed."""
-        most = _CHUNK_HEAD.size + _MAX_NAME + _SIZE.size
-        head = os.pread(self._file.fileno(), most, start)
-        _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(head)
-        if length > _MAX_NAME:
-            raise DamagedError('a chunk has an unknown compression')
-        end_of_name = _CHUNK_HEAD.size + length
-        name = head[_CHUNK_HEAD.size : end_of_name].decode()
-        (stored,) = _SIZE.unpack_from(head, end_of_name)
-        data = self._read(start + end_of_name + _SIZE.size, stored)
-        chunk = chunk_data(data, name, size)
-        if checksum and zlib.crc32(chunk) != checksum:
-            raise DamagedError('the checksum of a chunk is wrong')
-        return chunk
+        _, size = _HEAD.unpack(self._read(start - _HEAD.size, _HEAD.size))
+        return chunk_content(self._read(start, size))
+
+
+def chunk_content(record: bytes) -> bytes:
+    """The records in the record of a chunk, decompressed; DamagedError if they are not intact."""
+    _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(record)
+    if length > _MAX_NAME:
+        raise DamagedError('a chunk has an unknown compression')
+    end_of_name = _CHUNK_HEAD.size + length
+    name = record[_CHUNK_HEAD.size : end_of_name].decode()
+    (stored,) = _SIZE.unpack_from(record, end_of_name)
+    begin = end_of_name + _SIZE.size
+    if stored > len(record) - begin:
+        raise DamagedError('a field ends beyond its record')
+    chunk = chunk_data(record[begin : begin + stored], name, size)
+    if checksum and zlib.crc32(chunk) != checksum:
+        raise DamagedError('the checksum of a chunk is wrong')
+    return chunk
+
+
+def intact_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Kind and content of the records after the magic of a damaged file that can be read.
+
+    Indexes and statistics, which describe what is no longer there, are left out.
+    """
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        kind, size = _HEAD.unpack(head)
+        if size > MAX_CHUNK_BYTES:
+            return  # damage: no way leads to the next record
+        record = file.read(size)
+        if len(record) < size:
+            return
+        if kind in (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE):
+            yield kind, record
+        elif kind == _CHUNK:
+            with suppress(Exception):  # damaged bytes can raise anything in the decompressors
+                for _ in _records_of(memoryview(chunk_content(record))):
+                    pass
+                yield kind, record
+
+
+def write_records(file: BinaryIO, records: Iterable[tuple[int, bytes]]) -> None:
+    """Write a file of these records, without a summary."""
+    magic = Source.MCAP.value
+    file.write(magic)
+    for kind, record in records:
+        file.write(_HEAD.pack(kind, len(record)) + record)
+    size = _END.size - _HEAD.size - len(magic)
+    file.write(_END.pack(_FOOTER, size, 0, 0, 0, magic))
 
 
 def _records_of(chunk: memoryview) -> Iterator[tuple[int, int, int]]:

@@ -61,6 +61,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         'rs_relpose_ros.cli.poses:REPLAY',
         'estimate relative poses from a bag: CSV, summary and pictures',
     ),
+    'report': (
+        'rs_relpose_ros.cli.report',
+        'one HTML page about a bag: can it be used, what is wrong, what comes out',
+    ),
     'unroll': (
         'rs_relpose_ros.cli.recordings:UNROLL',
         'derotate the images of a bag to the time of their middle row',

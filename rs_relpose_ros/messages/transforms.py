@@ -160,8 +160,8 @@ def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
 
 
 def _frame_id(bag: Any, topic: Any) -> str:
-    """frame_id of the first message of a topic; empty without one."""
-    first = next(iter(bag.messages([topic])), None)
+    """frame_id of the first message of a topic; empty without a topic or a message."""
+    first = None if topic is None else next(iter(bag.messages([topic])), None)
     return '' if first is None else str(first.message.header.frame_id).lstrip('/')
 
 

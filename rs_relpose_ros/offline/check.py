@@ -70,6 +70,22 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
             sample = check_recording.sampled(source, images, completion.parameters)
     for _ in source:  # all of it without a sample
         pass
+    findings = stream_findings(bag, chosen, parameters, contradiction, scan)
+    if topics is not None:
+        if sample is not None and sample.is_lost and completion.found is None:
+            with suppress(InputError):  # the recording permits no calibration
+                completion = completion._replace(
+                    found=check_recording.calibrated(bag, topics, completion.parameters)
+                )
+        faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
+        findings += joint_findings(scan, sample, completion, parameters, faults)
+    return CheckReport(str(bag.path), with_parents(findings))
+
+
+def stream_findings(
+    bag: Bag, chosen: Chosen, parameters: Parameters, contradiction: str, scan: Scan
+) -> list[Line]:
+    """Findings on topics and streams that were read; `contradiction`: of `with_extrinsics`."""
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if contradiction:
         findings.append(
@@ -92,14 +108,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
     if chosen.imu is not None:
         findings += _imu(scan, bag.reliability(chosen.imu), parameters, faults)
-    if topics is not None:
-        if sample is not None and sample.is_lost and completion.found is None:
-            with suppress(InputError):  # the recording permits no calibration
-                completion = completion._replace(
-                    found=check_recording.calibrated(bag, topics, completion.parameters)
-                )
-        findings += joint_findings(scan, sample, completion, parameters, faults)
-    return CheckReport(str(bag.path), with_parents(findings))
+    return findings
 
 
 def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Line:

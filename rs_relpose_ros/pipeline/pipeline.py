@@ -13,7 +13,7 @@ import numpy as np
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.assessment import Configured, configured_sigmas
 from rs_relpose_ros.calibration.posterior import PairData
-from rs_relpose_ros.calibration.rotations import rotation_of_rays
+from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
@@ -227,6 +227,11 @@ class Pipeline(Processor[PairResult]):
         """Consistency of the configuration after all pairs so far."""
         self.prepare()
         return self._monitor.health
+
+    @property
+    def rotations(self) -> RotationSums:
+        """Rotations by the images and by the gyro over the last seconds."""
+        return self._monitor.rotations
 
     def _restart_from(self, frame: Frame[Any]) -> None:
         self._previous = frame
@@ -517,3 +522,8 @@ class FrontEnd(FrameLoop[PairResult]):
     def health(self) -> findings.Assessment:
         """Consistency of the configuration after all pairs so far: each is published before."""
         return self._pipeline.health
+
+    @property
+    def rotations(self) -> RotationSums:
+        """Rotations by the images and by the gyro over the last seconds."""
+        return self._pipeline.rotations
