@@ -1,8 +1,10 @@
 """A simulated walk as the loggers of phones, data sets and calibration tools write it."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,7 +40,30 @@ def phone_walk() -> Simulation:
     return simulate(config)
 
 
-def lens_of(walk: Simulation) -> list[float]:
+class Upright:
+    """A walk whose logger rotates images clockwise by a quarter turn, and the lens with them."""
+
+    def __init__(self, walk: Simulation) -> None:
+        self._walk = walk
+        camera = walk.camera
+        self.camera = replace(
+            camera,
+            width=camera.height,
+            height=camera.width,
+            fx=camera.fy,
+            fy=camera.fx,
+            cx=camera.height - 1 - camera.cy,
+            cy=camera.cx,
+        )
+
+    def image(self, index: int) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(self._walk.image(index), -1))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._walk, name)
+
+
+def lens_of(walk: Simulation | Upright) -> list[float]:
     camera = walk.camera
     return [camera.fx, camera.fy, camera.cx, camera.cy]
 

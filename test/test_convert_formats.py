@@ -94,6 +94,19 @@ def test_logger_against_the_walk(name, walk, tmp_path):
     poses_are_right(walk, tmp_path, tmp_path / 'bag', *of_lens(walk))
 
 
+@pytest.mark.parametrize('name', ['tables', 'ios_logger', 'stray_scanner', 'opencamera_sensors'])
+def test_upright_recordings_are_turned_back_to_the_rows_of_the_sensor(name, walk, tmp_path):
+    upright = made.Upright(walk)
+    read = converted('phone', LOGGERS[name](tmp_path / 'in', upright), tmp_path / 'bag')
+    assert (read.axes * made.PHONE_AXES.inv()).magnitude() < 1e-7
+    for number in (0, 7):
+        assert np.abs(read.pixels(number).astype(float) - walk.image(number)).mean() < 6
+    if name in ('ios_logger', 'stray_scanner'):
+        found = read.parameters.intrinsics.camera_matrix
+        np.testing.assert_allclose(np.take(found, (0, 4, 2, 5)), made.lens_of(walk))
+    poses_are_right(walk, tmp_path, tmp_path / 'bag', *of_lens(walk))
+
+
 def test_intrinsics_of_a_logger_are_a_parameter(walk, tmp_path):
     fx, fy, cx, cy = made.lens_of(walk)
     for name in ('ios_logger', 'stray_scanner'):

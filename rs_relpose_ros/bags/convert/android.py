@@ -13,11 +13,12 @@ from rs_relpose_ros.bags.convert.phone import (
     camera_axes,
     displayed_axes,
     exposure_values,
-    landscape_video,
     phone_recording,
-    refuse_portrait,
+    sensor_matrix,
+    sensor_video,
     skew_values,
     STAMP_ROW_OF_ANDROID,
+    turns_back,
 )
 from rs_relpose_ros.bags.convert.recording import camera_matrix, image_file, Recording
 from rs_relpose_ros.bags.convert.text_files import (
@@ -65,6 +66,8 @@ def read_posecam(folder: Path) -> Recording:
     skew = 'rolling_shutter_skew_ns'
     camera = optional_object(folder / 'device.json').get('camera')
     known = camera if isinstance(camera, Mapping) else {}
+    logged = known.get('sensor_orientation_deg')
+    orientation = logged if type(logged) is int else None
     return phone_recording(
         folder,
         ': recorded with PoseCam',
@@ -74,12 +77,13 @@ def read_posecam(folder: Path) -> Recording:
         [
             *skew_values(reals(metadata, skew), skew),
             *exposure_values(reals(metadata, 'exposure_time_ns')),
-            *_intrinsics(folder / 'intrinsics.json'),
+            *_intrinsics(folder / 'intrinsics.json', orientation),
             *bias,
             STAMP_ROW_OF_ANDROID,
         ],
-        camera_axes(known.get('sensor_orientation_deg')),
+        camera_axes(logged),
         _truth(poses, folder / 'manifest.json'),
+        orientation=orientation,
     )
 
 
@@ -141,7 +145,7 @@ def _pose(row: Row) -> TruePose:
     return TruePose(row.nanoseconds('timestamp_ns'), row.vector('tx', 'ty', 'tz'), (x, y, z, w))
 
 
-def _intrinsics(path: Path) -> list[SourcedValue]:
+def _intrinsics(path: Path, orientation: int | None) -> list[SourcedValue]:
     if not path.is_file():
         return []
     found = read_object(path)
@@ -149,10 +153,12 @@ def _intrinsics(path: Path) -> list[SourcedValue]:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f'{path} must have the numbers fx, fy, cx and cy')
     width, height = found.get('width'), found.get('height')
-    if isinstance(width, int) and isinstance(height, int):
-        refuse_portrait(path.with_name('frames'), width, height)
     fx, fy, cx, cy = map(float, values)
-    return [camera_matrix(fx, fy, cx, cy, "ARCore's intrinsics, without distortion.")]
+    matrix = fx, fy, cx, cy
+    if isinstance(width, int) and isinstance(height, int) and height > width:
+        turns = 1 if orientation is None else turns_back(orientation)
+        matrix = sensor_matrix(matrix, (height, width), turns)
+    return [camera_matrix(*matrix, "ARCore's intrinsics, without distortion.")]
 
 
 # -- MARS Logger ----------------------------------------------------------------------------------
@@ -164,7 +170,7 @@ _MAX_DRIFT_NS = 1_000_000
 
 def read_mars(folder: Path) -> Recording:
     """Read frames of the movie with the logged stamps, and the IMU, of the MARS Logger."""
-    video = landscape_video(folder / 'movie.mp4')
+    video = sensor_video(folder / 'movie.mp4')
     stamps = folder / 'frame_timestamps.txt'
     shift_ns, clock = _clock(folder / 'edge_epochs.txt')
     stamps_ns = [
@@ -250,7 +256,7 @@ def read_opencamera_sensors(folder: Path) -> Recording:
     if gyro_path is None:
         raise MissingInputError(f'{name}_gyro.csv is missing in the folders of {folder}')
     stamps = gyro_path.with_name(f'{name}_timestamps.csv')
-    video = landscape_video(videos[0])
+    video = sensor_video(videos[0])
     stamps_ns = [row.nanoseconds(0) for row in read_rows(stamps, range(1))]
     gyro = [ImuSample(stamp, value, None) for stamp, value in _samples(gyro_path)]
     accel_path = gyro_path.with_name(f'{name}_accel.csv')

@@ -10,7 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_relpose_ros.bags.convert.phone import displayed_axes, landscape_video, phone_recording
+from rs_relpose_ros.bags.convert.phone import (
+    displayed_axes,
+    phone_recording,
+    sensor_matrix,
+    sensor_video,
+)
 from rs_relpose_ros.bags.convert.recording import (
     camera_matrix,
     image_file,
@@ -73,7 +78,7 @@ def read_ios_logger(folder: Path) -> Recording:
     rows = headless_rows(stamps, 2)
     if not rows:
         raise MissingInputError(f'{stamps} has no lines')
-    video = landscape_video(folder / 'Frames.m4v')
+    video = sensor_video(folder / 'Frames.m4v')
     images = video.frames([row.seconds_as_nanoseconds(0) for row in rows], stamps)
     gyro = [
         ImuSample(row.seconds_as_nanoseconds(0), row.vector(1, 2, 3), None)
@@ -91,8 +96,8 @@ def read_ios_logger(folder: Path) -> Recording:
     lens = []
     if 5 in rows[0].words:
         values = np.median([[row.real(k) for k in range(2, 6)] for row in rows], axis=0)
-        fx, fy, cx, cy = values.tolist()
-        lens = [camera_matrix(fx, fy, cx, cy, "Median of ARKit's intrinsics, no distortion.")]
+        matrix = sensor_matrix(values.tolist(), (video.width, video.height), video.turns)
+        lens = [camera_matrix(*matrix, "Median of ARKit's intrinsics, no distortion.")]
     details = ': recorded with ios_logger'
     axes = displayed_axes(video, accel)
     return phone_recording(folder, details, images, gyro, accel, (*lens, _STAMP_ROW), axes)
@@ -106,7 +111,7 @@ def read_stray_scanner(folder: Path) -> Recording:
 
     odometry.csv has a row for each frame: its stamp [s], and ARKit's pose of the optical frame.
     """
-    video = landscape_video(folder / 'rgb.mp4')
+    video = sensor_video(folder / 'rgb.mp4')
     poses = read_table(folder / 'odometry.csv')
     stamps_ns = [row.seconds_as_nanoseconds('timestamp') for row in poses]
     samples = read_table(folder / 'imu.csv')
@@ -126,13 +131,13 @@ def read_stray_scanner(folder: Path) -> Recording:
         video.frames(stamps_ns, folder / 'odometry.csv'),
         imu,
         (),
-        (*_stray_lens(folder / 'camera_matrix.csv'), _STAMP_ROW),
+        (*_stray_lens(folder / 'camera_matrix.csv', video), _STAMP_ROW),
         displayed_axes(video, imu),
         tuple(map(_stray_pose, stamps_ns, poses)),
     )
 
 
-def _stray_lens(path: Path) -> list[SourcedValue]:
+def _stray_lens(path: Path, video: Video) -> list[SourcedValue]:
     if not path.is_file():
         return []
     rows = list(read_rows(path, range(3)))
@@ -140,7 +145,8 @@ def _stray_lens(path: Path) -> list[SourcedValue]:
         raise InputError(f'{path} must have three rows, got {len(rows)}')
     fx, fy = rows[0].real(0), rows[1].real(1)
     cx, cy = rows[0].real(2), rows[1].real(2)
-    return [camera_matrix(fx, fy, cx, cy, "ARKit's intrinsics, without distortion.")]
+    matrix = sensor_matrix((fx, fy, cx, cy), (video.width, video.height), video.turns)
+    return [camera_matrix(*matrix, "ARKit's intrinsics, without distortion.")]
 
 
 def _stray_pose(stamp_ns: int, row: Row) -> TruePose:
@@ -184,7 +190,7 @@ def _sensor_logger_images(folder: Path) -> tuple[Video | None, tuple[RecordedIma
     if len(videos) > 1:
         raise InputError(f'{folder} has {len(videos)} videos: there must be one')
     if videos:
-        video = landscape_video(videos[0])
+        video = sensor_video(videos[0])
         start_ns = int(videos[0].stem) * 1_000_000
         stamps_ns = [start_ns + time_ns for time_ns in video.times_ns()]
         return video, video.frames(stamps_ns, videos[0])

@@ -16,6 +16,7 @@ from rs_relpose_ros.bags.convert.recording import (
     readout_values,
     RecordedImage,
     Recording,
+    turned_back,
 )
 from rs_relpose_ros.bags.convert.text_files import (
     file_inside,
@@ -73,18 +74,22 @@ def phone_recording(
     values: Sequence[SourcedValue] = (),
     axes: SourcedValue | None = None,
     truth: tuple[TruePose, ...] = (),
+    *,
+    orientation: int | None = None,
 ) -> Recording:
     """Make a recording of a phone, which is not calibrated.
 
     `details` are for the title, `values` the parameters that the logger knows, `axes` those of
-    its camera where it is not the usual one.
+    its camera where it is not the usual one. `orientation`: that of its sensor [deg], if logged.
+    Images that are higher than wide were rotated upright, and are turned back.
     """
     known = {value.name for value in values}
     defaults = [value for value in _DEFAULTS if value.name not in known]
     axes = axes or camera_axes()
+    turns = 1 if orientation is None else turns_back(orientation)
     return Recording(
         None,
-        images,
+        tuple(turned_back(image, turns) for image in images),
         imu,
         f'Parameters of relpose_node for {folder.name} (`rs_relpose convert phone`){details}.',
         (recording.COMPRESSED, *values, *defaults, axes),
@@ -99,6 +104,11 @@ def phone_recording(
 _USUAL_ORIENTATION = 90
 # Source of the axes, in words.
 _ORIENTATION = '{}: back camera with SENSOR_ORIENTATION {} deg, {}.'
+# The same of images that were rotated upright.
+_TURNED = (
+    'ASSUMED: back camera with SENSOR_ORIENTATION {} deg, as most phones have it. The images were '
+    'upright: they are turned back, so that their rows are those of the sensor.'
+)
 # The display orientation tells that of the sensor if the phone is held within this angle of one
 # of its four sides [deg]. [chosen: 45 is ambiguous; any value from 20 to 40 would do]
 _MOST_TILTED = 30.0
@@ -131,6 +141,8 @@ def displayed_axes(video: Video, accel: Sequence[ImuSample]) -> SourcedValue:
     gravity shows: both together give SENSOR_ORIENTATION.
     """
     forces = [sample.linear_acceleration for sample in accel if sample.linear_acceleration]
+    if video.turns:
+        return _axes_of(_USUAL_ORIENTATION, _TURNED.format(_USUAL_ORIENTATION))
     if not video.display_rotation or not forces:
         return camera_axes()
     up = np.median(forces, axis=0)
@@ -145,20 +157,40 @@ def displayed_axes(video: Video, accel: Sequence[ImuSample]) -> SourcedValue:
     return _axes_of(orientation, _ORIENTATION.format('Of this recording', orientation, how))
 
 
-def refuse_portrait(path: Path, width: int, height: int) -> None:
-    """Refuse images that are higher than wide, as those of no phone's sensor are."""
-    if height > width:
-        raise InputError(
-            f'{path} has images of {width}x{height}: they were rotated, and their rows are the '
-            "sensor's columns; record in the sensor's own orientation (landscape)"
-        )
+def turns_back(sensor_orientation: int) -> int:
+    """Return the quarter turns, counterclockwise, from an upright image to the sensor's rows.
+
+    `sensor_orientation`: the angle [deg] by which the logger has rotated the image clockwise.
+    """
+    return -1 if sensor_orientation % 360 == 270 else 1
 
 
-def landscape_video(path: Path) -> Video:
-    """Open a video whose frames are as the sensor reads them."""
+def sensor_video(path: Path) -> Video:
+    """Open a video whose frames are as the sensor reads its rows.
+
+    Frames that are higher than wide were rotated upright, and are turned back.
+    """
     video = Video(path)
-    refuse_portrait(path, video.width, video.height)
+    if video.height > video.width:
+        video.turn(turns_back(_USUAL_ORIENTATION))
     return video
+
+
+def sensor_matrix(
+    matrix: Sequence[float], size: tuple[int, int], turns: int
+) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy [px] for the rows of the sensor.
+
+    `size` (width, height) is that of the images as the sensor reads them, which were turned by
+    `turns`. The principal point shows whether the matrix is of the images before.
+    """
+    fx, fy, cx, cy = matrix
+    if not turns or cx > cy:
+        return fx, fy, cx, cy
+    width, height = size
+    if turns == 1:
+        return fy, fx, cy, height - 1.0 - cx
+    return fy, fx, width - 1.0 - cy, cx
 
 
 # -- What Android's camera reports ----------------------------------------------------------------
@@ -212,7 +244,7 @@ def read_tables(folder: Path) -> Recording:
         paths = [file_inside(folder, row, 'file') for row in frames]
         images = tuple(map(image_file, stamps_ns, paths))
     else:
-        video = landscape_video(_only_video(folder, frames[0].path))
+        video = sensor_video(_only_video(folder, frames[0].path))
         images = video.frames(stamps_ns, frames[0].path)
         axes = displayed_axes(video, accel)
     details = '. `rs_relpose calibrate` estimates readout time and focal length'

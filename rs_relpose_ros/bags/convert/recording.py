@@ -10,6 +10,7 @@ from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from rs_relpose_ros.bags import reader
@@ -56,6 +57,29 @@ def image_file(stamp_ns: int, path: Path) -> RecordedImage:
         return check_file(path, _MAX_IMAGE_BYTES).read_bytes()
 
     return RecordedImage(stamp_ns, str(path), read)
+
+
+# Quality of a JPEG image that is turned, and so compressed again. [chosen: from 85 on the noise of
+# matches does not depend on it (docs/lab)]
+_TURNED_QUALITY = 95
+
+
+def turned_back(image: RecordedImage, turns: int) -> RecordedImage:
+    """Turn an image that is higher than wide by quarter turns, counterclockwise; others stay."""
+
+    def read() -> bytes:
+        data = image.encoded()
+        width, height = encoded_image_size(np.frombuffer(data, dtype=np.uint8))
+        if height <= width:
+            return data
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise InputError('the image cannot be decoded')
+        turned = np.ascontiguousarray(np.rot90(pixels, turns))
+        quality = [cv2.IMWRITE_JPEG_QUALITY, _TURNED_QUALITY]
+        return bytes(cv2.imencode('.jpg', turned, quality)[1])
+
+    return RecordedImage(image.stamp_ns, image.name, read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +158,14 @@ def _write_images(bag: BagWriter, recording: Recording, on_image: Callable[[], o
     readout = 0.0 if camera is None else camera.readout_time
     delay_ns = to_nanoseconds(reader.IMAGE_DELAY + readout)
     for image in recording.images:
-        data = image.encoded()
         try:
+            data = image.encoded()
             found = encoded_image_size(np.frombuffer(data, dtype=np.uint8))
+        except MissingInputError:
+            raise
         except InputError as error:
-            raise InputError(f'{image.name}: {error}') from error
+            text = str(error)
+            raise InputError(text if image.name in text else f'{image.name}: {text}') from error
         size = size or found
         if found != size:
             raise InputError(

@@ -81,7 +81,12 @@ _CONVENTIONS = (
 
 
 class Video:
-    """The first video stream of a file, as encoded: a rotation for display is not applied."""
+    """The first video stream of a file, as encoded: a rotation for display is not applied.
+
+    `turns`: quarter turns (counterclockwise) that are applied to each frame.
+    """
+
+    turns = 0
 
     def __init__(self, path: Path) -> None:
         self.path = check_file(path)
@@ -111,6 +116,11 @@ class Video:
         degrees = 0 if frame is None else round(getattr(frame, 'rotation', 0))
         container.seek(0)
         return -degrees % 360
+
+    def turn(self, turns: int) -> None:
+        """Turn all frames by an odd number of quarter turns, counterclockwise."""
+        self.turns = turns
+        self.width, self.height = self.height, self.width
 
     def __len__(self) -> int:
         return len(self._pts)
@@ -145,9 +155,9 @@ class Video:
                 if frame.pts > self._pts[number]:
                     break
                 self._next = number + 1
-                pixels = frame.to_ndarray(format='bgr24')
+                pixels = np.rot90(frame.to_ndarray(format='bgr24'), self.turns)
                 quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-                return bytes(cv2.imencode('.jpg', pixels, quality)[1])
+                return bytes(cv2.imencode('.jpg', np.ascontiguousarray(pixels), quality)[1])
         raise InputError(
             f'{self.path}: frame {number + 1} of {len(self)} cannot be decoded: the '
             'file is damaged'
