@@ -148,7 +148,11 @@ class ConsistencyMonitor:
             self.acceleration.clear()
         also = self.acceleration.finding()
         also_found = () if also is None else (also,)
-        self.health = Assessment((*self.health.findings, *also_found, *self.image_findings))
+        found = (*self.health.findings, *also_found)
+        # A gyro of another unit moves images elsewhere: parts seem still by chance.
+        if not any(one.code is findings.Code.GYRO_UNIT for one in found):
+            found = (*found, *self.image_findings)
+        self.health = Assessment(found)
 
     def _deviation(self) -> Array:
         """(K,) from the active values, of all inconsistent quantities."""
