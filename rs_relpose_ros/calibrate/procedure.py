@@ -27,7 +27,7 @@ from rs_relpose_ros.calibration.observations import (
 )
 from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
-from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.core.deviations import by_name, OFFLINE
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
@@ -39,22 +39,32 @@ from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
-_LEAST_MATCHES, _LEAST_FRAMES = 20, 40
+# Least number of points in common of a pair, and of points per image in the median. Fewer hardly
+# determine the unknowns of a pair. [chosen: twice the eight unknowns, and some]
+_LEAST_MATCHES = 20
+# Least number of frames of a recording. [chosen: more than a second at 30 Hz]
+_LEAST_FRAMES = 40
 # Spans [s]: over long ones the gyro's rates at the rows differ; over short ones the errors of the
 # tracker add up less and the velocity of the camera is constant. The noise of each pair determines
 # its weight.
 _ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
+# Pairs of quick fits: of the lens before all pairs, and of the cost over the readout time.
 _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
+# Pairs of the fits from each of the starts, of the span that converges from afar.
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
+# Neighbouring frames, whose rotation is compared with the gyro.
 _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
-# Changes of the lens within which the fit is linear in it, and fits at the most.
+# Changes of the lens within which the fit is linear in it: focal length, aspect, coefficients,
+# principal point [px]. [chosen: the error of second order is below 0.1 px there]
 _LENS_STAYS = (0.01, 0.01, 0.02, 0.02, 0.02, 5.0, 5.0)
+# Largest number of fits, each about its own lens. [chosen: two or three are usual]
 _LENS_ROUNDS = 6
-# Places of the parameters of an unknown lens.
-_LENS = OFFLINE.mask('focal_log', 'principal_point')
-_LENS[model.RADIAL] = True
+# Parameters of an unknown lens that are estimated.
+_LENS = OFFLINE.mask('focal_log', 'principal_point') | (np.arange(model.GLOBAL) == model.RADIAL)
 # Sigma of an angle that is not known [rad].
 _ANY_ANGLE = math.pi / math.sqrt(3.0)
+# Focal lengths that are tried, over the guess. [chosen: steps of 19 %, from which the fit
+# converges]
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
@@ -290,6 +300,7 @@ def _fit_with_lens(
 
 # -- Result of a fit, and observability --------------------------------------------------------
 
+# What to do if a value is not observable.
 _RECORD_MORE = (
     'too little rotation, too short, or too few points: record 10 s or more of a '
     'textured scene while rotating 20 to 60 deg/s about all three axes'
@@ -304,18 +315,27 @@ _UNCLEAR = {
 # Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
 _USELESS = 10.0
 # Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
-# focal length (relative).
-_MOST = np.zeros(model.GLOBAL)
-_MOST[[model.READOUT, model.OFFSET, model.SLOPE, model.FOCAL]] = 1.5e-3, 3e-3, 0.5, 0.03
-_MOST[model.BIAS] = 0.01
-# Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
-# tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
-# exposure also changes within one step of the interval; of the focal length (relative), as the
-# residual is not linear in the noise of the points.
-_COMMON = np.zeros((2, model.GLOBAL))
-_COMMON[:, model.FOCAL] = 2e-4
-_COMMON[1, [model.READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
-_COMMON[1, model.ROTATION], _COMMON[1, model.BIAS] = 1e-3, 2.5e-4
+# focal length (relative). [chosen: errors that poses hardly notice; docs/calibration.md]
+_MOST = by_name(
+    readout_time=1.5e-3,
+    time_offset=3e-3,
+    offset_per_interval=0.5,
+    gyro_bias=0.01,
+    focal_log=0.03,
+)
+# Error that is common to a recording and not part of its scatter: of the focal length (relative),
+# as the residual is not linear in the noise of the points. [measured: simulated tracks]
+_COMMON = by_name(focal_log=2e-4)
+# The same with a tracker: its own errors [s, rad, rad/s]; of the slope [s/s], as the exposure also
+# changes within one step of the interval. [measured: rendered bags with KLT]
+_COMMON_IN_IMAGES = by_name(
+    focal_log=2e-4,
+    readout_time=5e-5,
+    time_offset=5e-5,
+    offset_per_interval=0.08,
+    axes=1e-3,
+    gyro_bias=2.5e-4,
+)
 
 
 def evaluated(
@@ -381,7 +401,7 @@ def evaluated(
 
 def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[model.Unknowns, Array]:
     """Unknowns and covariance of a fit with the errors that are common to the recording."""
-    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
+    common = np.where(final.free, _COMMON_IN_IMAGES if config.exposed else _COMMON, 0.0)
     unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
     if not final.free[model.FOCAL]:
         return unknowns, covariance
@@ -522,9 +542,13 @@ def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '
 
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
-# The current image becomes the reference when this share of the points is left, or after so many
-# images.
-_KEPT, _RENEWED_AFTER = 0.8, 30
+# The current image becomes the reference when less than this share of the points is left. A larger
+# share adds up errors from reference to reference, a smaller one loses points.
+# [chosen: 0.7 to 0.9 would do]
+_KEPT = 0.8
+# It also does after so many images, by which the appearance of points has changed.
+# [chosen: a second at 30 Hz]
+_RENEWED_AFTER = 30
 # The gyro is kept for longer than the images [ns], as the clocks may differ.
 _MARGIN_NS = to_nanoseconds(1.0)
 # A driver repeats the last sample for at most this time [ns]. A gyro that gives equal values for

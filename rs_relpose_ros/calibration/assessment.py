@@ -65,10 +65,12 @@ _LONG_ROTATION = 2.0
 # Share of the rotation that may remain in images of the gyro's own camera.
 # [chosen: independent rotations leave 1 in the mean; 0.75 to 0.95 would do]
 _INDEPENDENT = 0.85
-# Axes that are rotated within these [rad] of half a turn about an axis of the image, or of a
-# quarter of one about the optical axis, may also be flipped images. Wider would offer that for any
-# large rotation, narrower would miss mounts that are not square. [chosen: 35 and 17 deg]
+# Axes that are rotated within this angle [rad] of half a turn about an axis of the image may also
+# be flipped images. Wider would offer that for any large rotation, narrower would miss mounts that
+# are not square. [chosen: 35 deg]
 _HALF_TURN = 0.6
+# The same of a quarter of a turn about the optical axis, of rotated images. It is narrower, as
+# quarters of a turn are nearer to each other. [chosen: 17 deg]
 _QUARTER_TURN = 0.3
 # Quantile of the pairs' shifts by which a deviation matters. The largest would follow a single
 # pair, the median would let pairs of little motion hide a deviation. [chosen: 0.8 to 0.95 would
@@ -80,8 +82,7 @@ _AS_CONFIGURED = 3.0
 # Error that linearisation leaves, 1 sigma as a share of the last step. Smaller shares would make
 # the sigma of a suggested value too small. [measured: on recordings with times that are far off,
 # steps are 0.4 to 0.8 of the error, with other parameters 0.9; docs/health.md]
-_REMAINS = np.full(LIVE.size, 0.25)
-_REMAINS[LIVE.mask('time_offset', 'readout_time')] = 1.0
+_REMAINS = np.where(LIVE.mask('time_offset', 'readout_time'), 1.0, 0.25)
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
 # selected with the wrong value. [measured: about 0.08 on recordings]
 _SELECTED = 0.1

@@ -118,9 +118,10 @@ def bent(weights: Array) -> float:
 
 # -- Errors beyond the noise of the matches -------------------------------------------------------
 
-# Regions of the image: columns and rows of equally many points. More regions have too few points
-# to scatter by more than noise, fewer hide a local error. [chosen: as the regions of a pair]
+# Columns of regions of the image, with equally many points each. More have too few points to
+# scatter by more than noise, fewer hide a local error. [chosen: as the regions of a pair]
 _COLUMNS = 4
+# Rows of these regions. [chosen: as the regions of a pair, by the shape of an image]
 _ROWS = 3
 # Mean squared difference, in sigmas, of the parameters of two halves that is chance.
 # [derived: the 95 % quantile of chi-square over its degrees of freedom, for the ten to twelve

@@ -27,6 +27,7 @@ from rs_relpose_ros.core.rows import gyro_matrix, turned_path, TurnedPath
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.gyro import GyroPath
 
+# Which of the parameters or pairs.
 Flags = NDArray[np.bool_]
 
 
@@ -57,6 +58,7 @@ _SAME_DIRECTION = 0.999
 # Longest step of a direction along a tangent, about a right angle: matches may not determine a
 # step, and a longer one would return near its start. [derived: the tangent of 45 deg]
 _LONGEST_TURN = 1.0
+# Step of the unknowns of the pairs that changes nothing.
 _STAY = np.zeros((1, LOCAL))
 
 
@@ -292,9 +294,11 @@ def _local_priors(problem: Problem) -> Array:
 _FIRST_DAMPING = 1e-3
 # Least damping of the parameters. [chosen: above the rounding of the sums]
 _LEAST_OF_PARAMETERS = 1e-9
-# Factors of the damping after a step that lowers the cost, and after one that does not.
-# [chosen: Levenberg-Marquardt with the usual decade; any value in 3..30 would do]
+# Factor of the damping after a step that lowers the cost. A smaller one needs more trials after a
+# good step. [chosen: Levenberg-Marquardt with the usual decade; any value in 0.03..0.3 would do]
 _LESS_DAMPING = 0.1
+# Factor of the damping after a step that does not lower the cost. A larger one shortens the next
+# step more than it needs. [chosen: the inverse; any value in 3..30 would do]
 _MORE_DAMPING = 10.0
 # Factor of the damping of a pair's own unknowns after a step that lowers its loss.
 # [chosen: slower than that of the parameters, as pairs alternate between two directions]
@@ -510,9 +514,11 @@ def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
 # Readout times of the curve besides the best one, from an interval upwards to one downwards.
 # [chosen: enough to draw a parabola or two minima; each costs two steps]
 _CURVE_POINTS = 13
-# Steps of the fit at the best readout time, and at each of the others from its neighbour.
-# [chosen: the curve is drawn, not evaluated]
+# Steps of the fit at the best readout time. Fewer leave the fewer pairs of the curve unsettled.
+# [chosen: the fit has converged with all pairs before]
 _STEPS_AT_BEST = 5
+# Steps at each of the other readout times, from the neighbour. More change the picture by less
+# than a line's width. [chosen: the curve is drawn, not evaluated]
 _STEPS_ALONG = 2
 
 

@@ -52,31 +52,48 @@ from rs_relpose_ros.jit import inlined_kernel, kernel
 
 # -- Data and unknowns ----------------------------------------------------------------------------
 
-# Places of the parameters of the calibration, which are the values of `OFFLINE`. Entries with more
-# than one value have slices. Those of the lens are beyond the assumed camera.
+# Places of the parameters of the calibration, which are the values of `OFFLINE`; entries with more
+# than one value have slices. From the first to the last row [s].
 READOUT = OFFLINE.index('readout_time')
+# Offset of the clocks at the middle row [s].
 OFFSET = OFFLINE.index('time_offset')
+# Change of the offset by the covariate of a frame [s/s].
 SLOPE = OFFLINE.index('offset_per_interval')
+# Turn of the camera's axes [rad].
 ROTATION = OFFLINE.part('axes')
+# Bias of the gyro [rad/s].
 BIAS = OFFLINE.part('gyro_bias')
+# Errors of the scale of each axis of the gyro.
 SCALE = OFFLINE.part('gyro_scale')
+# Skew between each two axes of the gyro [rad].
 SKEW = OFFLINE.part('gyro_skew')
+# Logarithm of the focal length over the assumed one. All of the lens is beyond that camera.
 FOCAL = OFFLINE.index('focal_log')
+# Ratio fy / fx.
 ASPECT = OFFLINE.index('aspect')
+# Coefficients k1, k2, k3.
 DISTORTION = OFFLINE.part('distortion')
+# Principal point [px].
 CENTER = OFFLINE.part('principal_point')
+# Square of the exposure beyond the assumed one [s^2].
 EXPOSURE = OFFLINE.index('exposure_square')
+# All of the lens, in the order of `geometry.lens`, at the end of the vector.
 LENS = deviations.LENS
+# Number of the parameters.
 GLOBAL = OFFLINE.size
 # First coefficient of the distortion.
 RADIAL = DISTORTION.start
-# Places of the unknowns of a pair, after the parameters: step of the direction in its tangent
-# plane (2), bend (3), turn (3) [rad].
+# Places of the unknowns of a pair, after the parameters.
 _UNKNOWNS = first_indices(parameters=GLOBAL, direction=2, bend=3, turn=3)
+# Step of the direction in its tangent plane.
 DIRECTION = _UNKNOWNS['direction']
+# Change of the velocity, over the displacement.
 BEND = _UNKNOWNS['bend']
+# Rotation that the noise of the gyro hides [rad].
 TURN = _UNKNOWNS['turn']
+# Number of the parameters and the unknowns of a pair.
 ALL = _UNKNOWNS['end']
+# Number of the unknowns of a pair.
 LOCAL = ALL - GLOBAL
 # Residual [sigma] beyond which the Geman-McClure loss is nearly constant. A smaller one takes good
 # matches for outliers, a larger one lets outliers move the optimum. [chosen: 3 sigmas, which one

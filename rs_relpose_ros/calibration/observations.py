@@ -26,6 +26,7 @@ from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 
+# Axes of the camera, for people.
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
 
@@ -167,7 +168,11 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
 # -- Exposure: the gyro is averaged over it -----------------------------------------------------
 
 # Where automatic exposure lengthens the intervals, the exposure is the interval less this [s].
-_MARGIN, _MARGIN_SIGMA = 0.008, 0.004
+# [chosen: a sensor needs a few ms between two exposures]
+_MARGIN = 0.008
+# Its sigma [s]. A smaller one would make the readout time too certain, which it changes.
+# [chosen: from nearly none to twice the margin]
+_MARGIN_SIGMA = 0.004
 # Change of the square of the exposure [s^2] over which its effect on the rates is taken.
 _SQUARE = 0.03**2
 
@@ -226,19 +231,34 @@ def noise_density(times: Array, rates: Array) -> float:
 
 
 # Frames further apart than so many intervals have lost some in between.
+# [derived: between one interval and two]
 _LOST = 1.5
+# Least number of pairs that a fit needs. Fewer do not determine the parameters.
+# [chosen: as many as parameters]
 _LEAST_PAIRS = 10
 # Pairs of a second that a fit uses at most: with all of them its sigmas are no smaller.
 _PAIRS_PER_SECOND = 80.0
-# Longest step between samples of the gyro that is interpolated [s], and rms rate below which the
-# camera is at rest about an axis [rad/s].
-MAX_GYRO_GAP, LEAST_ROTATION = 0.03, math.radians(2.0)
+# Longest step between samples of the gyro that is interpolated [s]. Over longer ones a hand turns
+# in between. [chosen: a gyro of 33 Hz]
+MAX_GYRO_GAP = 0.03
+# Rms rate below which the camera is at rest about an axis [rad/s]. Lower would take noise for a
+# rotation. [chosen: a tenth of the recommended 20 deg/s]
+LEAST_ROTATION = math.radians(2.0)
 # Prior of `bend`, 1 sigma, before the parallax is known.
 _BEND_AT_START = 0.1
-# 1 sigma of a gyro's bias [rad/s]; of the offset's change by a covariate [s/s]; of an unknown
-# lens: first coefficient of the distortion, principal point as a share of the width.
-_BIAS_SIGMA, _SLOPE_SIGMA = 0.03, 1.0
-_RADIAL_SIGMA, _CENTER_SIGMA = 0.3, 0.015
+# 1 sigma of a gyro's bias [rad/s]. A smaller one would hold a bias of a cheap gyro at zero.
+# [chosen: 1.7 deg/s, the limit of data sheets of MEMS gyros]
+_BIAS_SIGMA = 0.03
+# 1 sigma of the offset's change by a covariate [s/s], which is between -1 and 1.
+# [derived: a stamp at one or the other end of the exposure]
+_SLOPE_SIGMA = 1.0
+# 1 sigma of the principal point of an unknown lens, as a share of the width. A smaller one would
+# hold it in the middle, a larger one lets axes and principal point trade.
+# [chosen: cameras of phones and drones are within 3 %]
+_CENTER_SIGMA = 0.015
+# 1 sigma of the first coefficient of the distortion of an unknown lens.
+# [chosen: wide lenses have -0.3]
+_RADIAL_SIGMA = 0.3
 # Error of the rotation between two frames of a gyro without noise, by its sampling [rad].
 _LEAST_ROTATION = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.

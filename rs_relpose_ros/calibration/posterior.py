@@ -44,28 +44,39 @@ from rs_relpose_ros.geometry.motion import FrameMotion, rotations_at_rate
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.integration import ImuSlice
 
-# Sigma of the velocities about the mean one [baselines per second].
+# Sigma of the velocities about the mean one [baselines per second]. A smaller one takes a change
+# of velocity for a readout time, a larger one leaves the readout time undetermined.
+# [chosen: as the estimate of a pair]
 _VELOCITY_SIGMA = 1.0
-# Residuals of this many sigmas have half the weight of small ones (Cauchy).
+# Residuals of this many sigmas have half the weight of small ones (Cauchy). Fewer lose
+# information, more let wrong matches count. [derived: 95 % efficiency for normal residuals]
 _CAUCHY_SIGMAS = 2.4
-# Least noise of matches [px], and of the gyro's rotation between two frames [rad].
+# Least noise of matches [px]. It limits the information of matches without noise.
+# [chosen: below the noise of any tracker]
 _LEAST_SIGMA = 0.05
+# Least noise of the gyro's rotation between two frames [rad]; without it a gyro that is configured
+# as free of noise has no finite information. [chosen: below that of any gyro]
 _LEAST_ROTATION_SIGMA = 1e-5
-# Largest number of matches, evenly over those of the pair: more add cost and little information.
+# Largest number of matches, evenly over those of the pair. More cost time and add little, since
+# neighbours have the same errors. [chosen: 80 to 200 would do]
 _MOST_MATCHES = 120
-# Gyro beyond the rows [s].
+# Time by which the gyro must extend beyond the rows [s], for rounding.
+# [chosen: below any interval of a gyro]
 _LEAST_SPAN = 1e-4
 # Sigma of velocities [baselines/s] that matches of a global shutter do not observe: their change
 # by deviations stays finite. [chosen: 10 to 1000 would do: above any velocity]
 _UNKNOWN_VELOCITY = 30.0
-# Steps of a new fit of a pair.
+# Steps of a new fit of a pair, which starts near its optimum. Fewer would leave it off, more cost
+# time. [chosen: Gauss-Newton is quadratic; 3 to 5 would do]
 _NEW_STEPS = 3
-# Places of single deviations in the vector c.
 # Deviations of which the pose has a doubt: the principal point is not estimated, since axes of the
 # IMU have nearly the same effect.
 _DOUBTED = Selection.of(*LIVE.parts, 'principal_point', gyro_scale=COMMON, distortion=FIRST)
+# Places of single deviations in the vector c: of the time offset of the stamped row,
 _OFFSET = LIVE.index('time_offset')
+# of the readout time,
 _READOUT = LIVE.index('readout_time')
+# and of the first coefficient of the distortion.
 _DISTORTION = LIVE.index('distortion')
 # Number of deviations before those of the lens, which come last.
 _LENS = LIVE.index('focal_log')
@@ -446,6 +457,7 @@ def middle_share(camera: RollingShutterCamera) -> float:
 
 # -- Other times of the rows -------------------------------------------------------------------
 
+# Deviations that change the times of the rows.
 _TIMES = [_OFFSET, _READOUT]
 
 
@@ -499,16 +511,24 @@ def _far_in_time(deviations: Array) -> bool:
 
 # -- Sums over pairs ---------------------------------------------------------------------------
 
-# Pairs of the last seconds, at most so many.
+# Pairs count for this time [ns]. Longer would average over a calibration that changes with
+# temperature, shorter makes the sigmas larger. [chosen: 10 to 60 s would do]
 WINDOW_NS = to_nanoseconds(20.0)
+# Largest number of pairs. It bounds the work of `solved`. [derived: 5 pairs per second]
 MOST_PAIRS = 100
-# Older pairs that are linearised again with each new one, and distance in sigmas of the prior
-# within which that changes nothing.
-_AGAIN, _NEAR = 3, 0.02
-# Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
-# a pair's sigma that is common to all pairs, and not reduced by averaging: blur, the tracker's
-# bias, a lens that the model does not fit.
-_FEW_PAIRS, _SHARED = 6, 0.15
+# Older pairs that are linearised again with each new one. More cost time, each as much as a new
+# pair; fewer leave the rest about old deviations for longer. [chosen: 2 to 5 would do]
+_AGAIN = 3
+# Distance between deviations, in sigmas of the prior, within which another linearisation changes
+# nothing. [chosen: errors of second order are below 0.1 % there]
+_NEAR = 0.02
+# Sigmas of n pairs are widened by (n + 6) / n, since few scores scatter less than they should.
+# Fewer make findings of the first pairs too certain. [chosen: about half of the parameters]
+_FEW_PAIRS = 6
+# Share of a pair's sigma that is common to all pairs, and not reduced by averaging: blur, the
+# tracker's bias, a lens that the model does not fit. Less would make sigmas of many pairs too
+# small, more would hide deviations. [chosen: docs/health.md, "Limits"]
+_SHARED = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -531,6 +551,7 @@ class Calibration:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
+# Before the first pair.
 NOTHING_ESTIMATED = Calibration(
     np.zeros(LIVE.size),
     np.diag(LIVE.sigmas**2),

@@ -28,9 +28,11 @@ _WINDOW_NS = to_nanoseconds(8.0)
 # Largest number of rotations: every third frame and each pair of 8 s at 60 Hz. It bounds the work.
 # [derived: 8 s x 60 Hz / 3]
 _MOST_ROTATIONS = 160
-# Number of rotations that a comparison needs, and the sum of their angles [rad]. Less would
-# compare the noise of the matches. [chosen: 4 to 10, and 0.1 to 0.3]
+# Number of rotations that a comparison needs. Fewer would follow a single wrong one.
+# [chosen: 4 to 10 would do]
 _FEWEST = 5
+# Sum of their angles [rad] that it needs. Less would compare the noise of the matches.
+# [chosen: 0.1 to 0.3 would do]
 _LEAST_ANGLE = 0.15
 # Sum of squares [rad^2] that a constant rate leaves by rounding alone; it keeps a ratio finite.
 # [derived: squares of double rounding, 1e-32, times the number of rotations]

@@ -150,6 +150,14 @@ LIVE = Selection.of(
 OFFLINE = Selection.of(*PARTS)
 
 
+def by_name(**values: float) -> Array:
+    """The whole vector (N_DEVIATIONS,) with the same value in all components of these entries."""
+    whole = np.zeros(N_DEVIATIONS)
+    for name, value in values.items():
+        whole[PARTS[name]] = value
+    return whole
+
+
 def by_stamped_row(selection: Selection, share: float) -> Array:
     """Basis (N_DEVIATIONS, k) of a selection whose `time_offset` is that of the stamped row.
 
