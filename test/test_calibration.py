@@ -18,7 +18,7 @@ from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, eval
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.calibration import fit as fitting
 from rs_relpose_ros.calibration import model, observations
-from rs_relpose_ros.calibration.errors import doubts, fit, jackknife, stretches, widened
+from rs_relpose_ros.calibration.errors import Doubts, doubts, fit, jackknife, stretches, widened
 from rs_relpose_ros.calibration.fit import (
     evaluate,
     Fit,
@@ -56,8 +56,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 BIAS, CENTER = model.BIAS.start, model.CENTER.start
 ROTATION = model.ROTATION.start
 # Of an unknown lens, as `calibrate --lens`.
-FREE_LENS = OFFLINE.mask('focal_log', 'principal_point')
-FREE_LENS[model.RADIAL] = True
+FREE_LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
 MODELS = {
     'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
     'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
@@ -175,7 +174,7 @@ def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
         == pytest.approx(result.lens.focal_factor.value * guess, abs=0.01)
     )
     for found, estimate, true in (
-        (intrinsics.distortion[0], result.lens.radial, 0.0),
+        (intrinsics.distortion[0], result.lens.radial[0], 0.0),
         (intrinsics.cx, result.lens.column, camera.cx),
         (intrinsics.cy, result.lens.row, camera.cy),
     ):
@@ -194,7 +193,12 @@ def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
 
 @pytest.mark.parametrize(
     ('model', 'coefficients'),
-    [('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)), ('equidistant', (0.03, 0.0, 0.0, 0.0))],
+    [
+        ('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)),
+        ('equidistant', (0.03, 0.0, 0.0, 0.0)),
+        # Of a RealSense: k1 and k2 cancel each other towards the edge.
+        ('plumb_bob', (0.163, -0.520, 0.0, 0.0, 0.474)),
+    ],
 )
 def test_lens_is_estimated(model, coefficients, tmp_path):
     """All rows of a global shutter have one time: its pixels may be distorted afterwards.
@@ -228,10 +232,48 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
     assert found.distortion_model == model
     assert found.fx == pytest.approx(lens.fx, rel=0.01)
     assert 0.0 < sigmas.distortion_sigma < 0.02
-    assert abs(found.distortion[0] - coefficients[0]) < 4.5 * sigmas.distortion_sigma
+    assert found.distortion[0] == pytest.approx(result.lens.radial[0].value, abs=1e-5)
+    for estimate, true in zip(result.lens.radial, lens.radial_coefficients, strict=True):
+        assert abs(estimate.value - true) < 3.0 * estimate.sigma
+    # What it does to the image is known better than by the prior.
+    corner = observations.displacements([observations.corner_radius(lens)])[0]
+    displacement = result.lens.displacement
+    assert displacement.sigma < 0.01
+    assert abs(displacement.value - corner @ lens.radial_coefficients) < 3.0 * displacement.sigma
     assert 0.0 < sigmas.principal_point_sigma < 5.0
     assert abs(found.cx - lens.cx) < 4.5 * sigmas.principal_point_sigma
     assert abs(found.cy - lens.cy) < 4.5 * sigmas.principal_point_sigma
+
+
+@pytest.mark.parametrize('given', [True, False])
+def test_prior_of_a_lens_is_on_what_it_does_to_the_image(given):
+    """2 % of the radius at the corner and 1 % at half of it; a guess may have a k1 of 0.3."""
+    camera = camera_of(recorded().truth)
+    covariance = observations.distortion_prior(camera, given=given)
+    radius = observations.corner_radius(camera)
+    assert radius == pytest.approx(
+        np.linalg.norm([0.5 * camera.width, 0.5 * camera.height]) / camera.fx
+    )
+    for share, sigma in ((1.0, 0.02), (0.5, 0.01)):
+        r = share * radius
+        by_coefficients = np.array([r**2, r**4, r**6])
+        variance = by_coefficients @ covariance @ by_coefficients
+        expected = sigma**2 + (0.0 if given else (0.3 * r**2) ** 2)
+        assert variance == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_given_distortion_is_where_the_estimate_starts():
+    camera = dataclasses.replace(
+        camera_of(recorded().truth), distortion=(-0.2, 0.05, 1e-3, -1e-3, 0.0)
+    )
+    recording = CalibrationInput(recorded().tracks, recorded().gyro, camera, True, {})
+    unknown = recording.with_unknown_lens('equidistant')
+    assert unknown.camera == camera and unknown.lens_given and not unknown.focal_known
+    plain = dataclasses.replace(recording, camera=camera_of(recorded().truth))
+    lens = plain.with_unknown_lens('plumb_bob')
+    assert lens.camera.distortion == (0.0,) * 5 and lens.lens_given
+    guessed = dataclasses.replace(plain, focal_known=False).with_unknown_lens('plumb_bob')
+    assert not guessed.lens_given
 
 
 def test_rotation_about_one_axis_is_not_observable(tmp_path):
@@ -657,8 +699,10 @@ def test_errors_of_lens_and_gyro_are_added():
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
     # A gyro whose rates are 0.5 % larger has a bias that is 0.5 % larger, at least.
     bias = np.abs(recorded().truth.gyro_bias)
-    assert (np.sqrt(np.diag(difference)[model.BIAS]) > 0.3 * sigmas[model.SCALE] * bias).all()
-    none = widened(final, np.zeros(GLOBAL))
+    assert (
+        np.sqrt(np.diag(difference)[model.BIAS]) > 0.3 * sigmas.parameters[model.SCALE] * bias
+    ).all()
+    none = widened(final, Doubts(np.zeros(GLOBAL), 0.0))
     np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-9)
 
 
@@ -770,7 +814,7 @@ def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     wide = dataclasses.replace(final, covariance=covariance)
     curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     result = evaluated(data, wide, curve, CalibrationConfig())
-    *_, column, row = result.lens
+    column, row = result.lens.column, result.lens.row
     assert 0.9 * sigma < column.sigma < sigma
     assert row.sigma == pytest.approx(math.sqrt(covariance[CENTER + 1, CENTER + 1]), rel=0.1)
     # Moved to the middle by all but a hundredth.

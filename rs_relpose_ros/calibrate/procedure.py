@@ -56,11 +56,11 @@ _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
 # Changes of the lens within which the fit is linear in it: focal length, aspect, coefficients,
 # principal point [px]. [chosen: the error of second order is below 0.1 px there]
-_LENS_STAYS = (0.01, 0.01, 0.02, 0.02, 0.02, 5.0, 5.0)
+_LENS_STAYS = (0.01, 0.01, 0.02, 0.05, 0.05, 5.0, 5.0)
 # Largest number of fits, each about its own lens. [chosen: two or three are usual]
 _LENS_ROUNDS = 6
 # Parameters of an unknown lens that are estimated.
-_LENS = OFFLINE.mask('focal_log', 'principal_point') | (np.arange(model.GLOBAL) == model.RADIAL)
+_LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
 # Sigma of an angle that is not known [rad].
 _ANY_ANGLE = math.pi / math.sqrt(3.0)
 # Focal lengths that are tried, over the guess. [chosen: steps of 19 %, from which the fit
@@ -74,6 +74,7 @@ def calibrate(
     camera: RollingShutterCamera,
     *,
     focal_known: bool = True,
+    lens_given: bool = False,
     config: CalibrationConfig | None = None,
     quat_prior: Sequence[float] | None = None,
     rng: np.random.Generator | int = 0,
@@ -85,7 +86,8 @@ def calibrate(
     from the camera's by at most ``config.max_time_offset``; the readout time of `camera` is not
     used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
     `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,
-    first coefficient of the distortion and principal point are estimated. `rng` selects matches if
+    radial distortion (k1, k2, k3) and principal point are estimated; with `lens_given` about a
+    distortion that is given. `rng` selects matches if
     there are more than needed; `progress` is called with the finished share of the work.
     InputError if the recording cannot be used, with what to record instead.
     """
@@ -96,18 +98,21 @@ def calibrate(
             f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
             'at least 10 s with both'
         )
-    data = Observations.of(tracks, gyro, camera, config)
+
+    def about(lens: Array) -> Observations:
+        return Observations.of(tracks, gyro, camera, config, lens, lens_given)
+
+    data = about(np.zeros(N_LENS))
     _check_recording(data, config)
     progress(0.15)
 
-    def about(lens: Array) -> Observations:
-        return data if not lens.any() else Observations.of(tracks, gyro, camera, config, lens)
-
-    return _calibrated(about, R_prior, focal_known, config, np.random.default_rng(rng), progress)
+    generator = np.random.default_rng(rng)
+    return _calibrated(about, data, R_prior, focal_known, config, generator, progress)
 
 
 def _calibrated(
     about: Callable[[Array], Observations],
+    data: Observations,
     R_prior: Array | None,
     focal_known: bool,
     config: CalibrationConfig,
@@ -118,7 +123,6 @@ def _calibrated(
 
     `about` gives the observations with a deviation of the lens.
     """
-    data = about(np.zeros(N_LENS))
     free = OFFLINE.mask('axes', 'time_offset', 'readout_time', 'gyro_bias')
     free[model.FOCAL] = not focal_known
     data, coarse = _coarse_fit(about, data, free, R_prior, config, rng)
@@ -365,7 +369,7 @@ def evaluated(
     jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
     notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying))
-    lens = _lens(data, parameters, sigmas, wide, one_axis) if final.free[model.FOCAL] else None
+    lens = _lens(data, parameters, covariance, wide, one_axis) if final.free[model.FOCAL] else None
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         readout_axis=data.camera.readout_axis,
@@ -432,20 +436,50 @@ def _angle_between(first: Array, second: Array) -> float:
 
 
 def _lens(
-    data: Observations, parameters: Array, sigmas: Array, wide: float, one_axis: str
+    data: Observations, parameters: Array, covariance: Array, wide: float, one_axis: str
 ) -> LensEstimates:
     """Estimates of the lens; the focal length is not observable by a rotation about one axis."""
     camera = data.camera.moved_lens(parameters[model.LENS])
-    focal_sigma, radial_sigma = float(sigmas[model.FOCAL]), float(sigmas[model.RADIAL])
+    sigmas = np.sqrt(np.diag(covariance))
+    focal_sigma = float(sigmas[model.FOCAL])
     column_sigma, row_sigma = map(float, sigmas[model.CENTER])
+    coefficients = camera.radial_coefficients.tolist()
     factor = math.exp(data.lens[0] + parameters[model.FOCAL])
     most = factor * wide * _MOST[model.FOCAL]
     return LensEstimates(
         _estimate(factor, factor * focal_sigma, most, one_axis),
-        Estimate(camera.distortion[0], radial_sigma, True),
+        tuple(
+            Estimate(value, float(sigma), True)
+            for value, sigma in zip(coefficients, sigmas[model.DISTORTION], strict=True)
+        ),
         Estimate(camera.cx, column_sigma, True),
         Estimate(camera.cy, row_sigma, True),
+        camera.distortion,
+        _displacement(camera, coefficients, covariance[model.DISTORTION, model.DISTORTION]),
+        _equivalent_sigma(camera, covariance[model.DISTORTION, model.DISTORTION]),
     )
+
+
+def _displacement(
+    camera: RollingShutterCamera, coefficients: list[float], covariance: Array
+) -> Estimate:
+    """Displacement of the corner of the image by k1, k2, k3, over its radius."""
+    by_coefficients = observations.displacements([observations.corner_radius(camera)])[0]
+    sigma = math.sqrt(by_coefficients @ covariance @ by_coefficients)
+    return Estimate(float(by_coefficients @ coefficients), sigma, True)
+
+
+# Shares of the corner's radius at which displacements are compared. Nearer to the middle there are
+# few pixels. [chosen: the outer three quarters of the area]
+_COMPARED_RADII = np.linspace(0.5, 1.0, 6)
+
+
+def _equivalent_sigma(camera: RollingShutterCamera, covariance: Array) -> float:
+    """Sigma of k1 that alone displaces as much as the covariance (3, 3) of k1, k2, k3."""
+    radii = observations.corner_radius(camera) * _COMPARED_RADII
+    by_coefficients = observations.displacements(radii)
+    variances = np.einsum('ni,ij,nj->n', by_coefficients, covariance, by_coefficients)
+    return float(np.max(np.sqrt(variances) / by_coefficients[:, 0]))
 
 
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:
@@ -568,6 +602,7 @@ class CalibrationInput:
     camera: RollingShutterCamera  # of the full sensor, its readout time 0
     focal_known: bool  # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]  # messages that were not used, by reason
+    lens_given: bool = False  # whether the distortion is that of a CameraInfo, yet estimated
     is_whole: bool = True  # whether the images show the whole sensor, without binning
 
     def calibrated(self, config: CalibrationConfig, **options: Any) -> CalibrationResult:
@@ -577,31 +612,30 @@ class CalibrationInput:
             self.gyro,
             self.camera,
             focal_known=self.focal_known,
+            lens_given=self.lens_given,
             config=config,
             **options,
         )
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
-        """The same for a lens that is to be estimated; InputError if it has a distortion."""
-        if any(self.camera.distortion):
-            raise InputError(
-                'the CameraInfo has distortion coefficients, beyond the first of '
-                'which nothing is estimated: calibrate without --lens'
-            )
+        """The same for a lens that is to be estimated, about the distortion of its CameraInfo.
+
+        Without a distortion there, the lens is of this model.
+        """
         if not self.is_whole:
             raise InputError(
                 'the CameraInfo has a region of interest or binning, which '
                 'camera_matrix cannot describe: calibrate without --lens'
             )
+        if any(self.camera.distortion):
+            return replace(self, focal_known=False, lens_given=True)
         counts = DISTORTION_MODELS[distortion_model].coefficient_counts
+        none = (0.0,) * max(counts[0], 5 if len(counts) > 2 else 4)
         return replace(
             self,
             focal_known=False,
-            camera=replace(
-                self.camera,
-                distortion_model=distortion_model,
-                distortion=(0.0,) * max(counts[0], 5 if len(counts) > 2 else 4),
-            ),
+            lens_given=self.focal_known,
+            camera=replace(self.camera, distortion_model=distortion_model, distortion=none),
         )
 
 

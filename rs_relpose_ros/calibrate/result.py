@@ -36,9 +36,12 @@ class LensEstimates(NamedTuple):
     """A lens that was not known."""
 
     focal_factor: Estimate  # true over assumed focal length
-    radial: Estimate  # first coefficient of the distortion
+    radial: tuple[Estimate, ...]  # coefficients k1, k2, k3 of the distortion
     column: Estimate  # principal point [px]
     row: Estimate
+    coefficients: tuple[float, ...]  # all of the distortion, in the order of CameraInfo
+    displacement: Estimate  # of the image's corner by k1, k2, k3, over its radius
+    radial_sigma: float  # of k1 that alone displaces as much as the sigmas of all three
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +141,8 @@ _DIRECTIONS = {
     'right': ', by columns from left to right',
     'left': ', by columns from right to left',
 }
+# Percent of the whole. [derived: definition]
+_PERCENT = 100.0
 
 
 # A quantity of the report: its name, its value with 1 sigma in words, and its estimate.
@@ -214,14 +219,17 @@ def _lens_quantities(result: CalibrationResult, camera: RollingShutterCamera) ->
     """The lens, where it was estimated."""
     if result.lens is None:
         return []
-    focal, radial, column, row = result.lens
+    lens = result.lens
+    focal = lens.focal_factor
     length = with_sigma(Code.FOCAL_LENGTH, camera.fx * focal.value, camera.fx * focal.sigma)
-    coefficient = f'{_rounded(radial, 3)} (first coefficient of {camera.distortion_model})'
-    place = f'{_rounded(column, 1)}, {_rounded(row, 1)} px'
+    coefficients = ', '.join(_rounded(radial, 3) for radial in lens.radial)
+    corner = _rounded(lens.displacement, 2, _PERCENT)
+    distortion = f'{coefficients} (k1, k2, k3 of {camera.distortion_model}; corner {corner} %)'
+    place = f'{_rounded(lens.column, 1)}, {_rounded(lens.row, 1)} px'
     return [
         ('focal length', length, focal),
-        ('distortion', coefficient, radial),
-        ('principal point', place, column),
+        ('distortion', distortion, lens.displacement),
+        ('principal point', place, lens.column),
     ]
 
 
@@ -395,8 +403,7 @@ def _clock_parameters(result: CalibrationResult) -> list[_Parameter]:
 
 
 def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[_Parameter]:
-    focal, radial, column, row = lens
-    others = (0.0,) * ((len(camera.distortion) or 4) - 1)
+    focal, column, row = lens.focal_factor, lens.column, lens.row
     return [
         (
             'camera_matrix',
@@ -416,11 +423,11 @@ def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[
         ('distortion_model', camera.distortion_model, ''),
         (
             'distortion_coefficients',
-            (round(radial.value, 5), *others),
-            'The first coefficient is estimated, the others are assumed to be zero.',
+            tuple(round(value, 5) for value in lens.coefficients),
+            'The radial coefficients k1, k2, k3 are estimated.',
         ),
         _sigma('focal_length', focal.sigma / focal.value, 5, 'Relative.'),
-        _sigma('distortion', radial.sigma, 5),
+        _sigma('distortion', lens.radial_sigma, 5, 'Of k1 that displaces as much.'),
         _sigma('principal_point', max(column.sigma, row.sigma), 2, 'In pixels.'),
     ]
 
@@ -428,10 +435,20 @@ def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
     """The result for a JSON file; seconds, radians, pixels."""
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    focal = radial = center = None
+    lens: dict[str, Any] = dict.fromkeys(
+        ('focal_px', 'distortion_first', 'distortion', 'displacement', 'principal_point_px')
+    )
     if result.lens is not None:
-        focal, radial, *center = map(asdict, result.lens)
+        focal = asdict(result.lens.focal_factor)
         focal |= {name: focal[name] * camera.fx for name in ('value', 'sigma')}
+        radial = [asdict(one) for one in result.lens.radial]
+        lens = {
+            'focal_px': focal,
+            'distortion_first': radial[0],
+            'distortion': radial,
+            'displacement': asdict(result.lens.displacement),
+            'principal_point_px': [asdict(result.lens.column), asdict(result.lens.row)],
+        }
     return {
         'observable': result.observable,
         'shutter': result.shutter,
@@ -445,9 +462,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'rotation_from_axis_map_rad': asdict(result.rotation),
         'axis_map': result.axis_map.tolist(),
         'gyro_bias_rad_per_s': [asdict(bias) for bias in result.gyro_bias],
-        'focal_px': focal,
-        'distortion_first': radial,
-        'principal_point_px': center,
+        **lens,
         'exposure_s': asdict(result.exposure),
         'exposure_margin_s': result.exposure_margin,
         'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),

@@ -8,7 +8,7 @@ D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the reco
 
 from dataclasses import replace
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,15 +134,20 @@ _GROSS = 9.0
 _HALF_ROUNDS = 15
 
 
-def widened(final: Fit, doubts: Array | None = None) -> Fit:
-    """The fit with a covariance of all errors, not only the noise of the matches.
+class Doubts(NamedTuple):
+    """Sigmas of what a fit holds; zero where there is no doubt."""
 
-    `doubts` (GLOBAL,) are sigmas of parameters that the fit holds; zero where there is no doubt.
-    """
+    parameters: Array  # (GLOBAL,)
+    tangential: float  # of p1 and p2
+
+
+def widened(final: Fit, doubts: Doubts | None = None) -> Fit:
+    """The fit with a covariance of all errors, not only the noise of the matches."""
     wider = np.sqrt(_between_regions(final) * _disagreement(final))
     scatter = final.covariance * np.outer(wider, wider)
     if doubts is not None:
-        scatter[final.block] += _of_doubts(final, doubts)
+        scatter[final.block] += _of_doubts(final, doubts.parameters)
+        scatter[final.block] += _of_tangential(final, doubts.tangential)
     return replace(final, covariance=scatter)
 
 
@@ -155,6 +160,29 @@ def _of_doubts(final: Fit, doubts: Array) -> Array:
     is_free = final.free[both]
     moves = np.linalg.solve(H[np.ix_(is_free, is_free)], H[np.ix_(is_free, ~is_free)])
     moves = moves * doubts[doubted]
+    return np.asarray(moves @ moves.T)
+
+
+# Share of a doubt for which derivatives are differences. [chosen: residuals change by less than
+# their noise, and more than by rounding; any value in 1e-4..0.1 would do]
+_SMALL = 0.01
+
+
+def _of_tangential(final: Fit, sigma: float) -> Array:
+    """Covariance (k, k) of the free parameters by the doubt of p1 and p2."""
+    problem, unknowns, free = final.problem, final.unknowns, final.free
+    H, _ = normal_equations(problem, final.evaluation, unknowns, free)
+    x, y = problem.points[..., 0], problem.points[..., 1]
+    mixed, squares = 2.0 * x * y, x * x + y * y
+    by_p1 = np.stack([mixed, squares + 2.0 * y * y], axis=-1)
+    by_p2 = np.stack([squares + 2.0 * x * x, mixed], axis=-1)
+    here = final.evaluation.score.sum(axis=0)
+    gradients = []
+    for displacement in (by_p1, by_p2):
+        moved = problem._replace(points=problem.points - _SMALL * sigma * displacement)
+        there = evaluate(moved, unknowns, free).score.sum(axis=0)
+        gradients.append((there - here) / _SMALL)
+    moves = np.linalg.solve(H, np.transpose(gradients))
     return np.asarray(moves @ moves.T)
 
 
@@ -239,16 +267,16 @@ _ASPECT_DOUBT = 0.002
 _CENTER_DOUBT = 0.005
 # First coefficient of a given distortion.
 _RADIAL_DOUBT = 0.02
-# Second coefficient, where the first one is estimated.
-_SECOND_DOUBT = 0.02
+# Tangential coefficients p1 and p2 of the distortion.
+_TANGENTIAL_DOUBT = 5e-4
 # Scale of each axis of the gyro.
 _SCALE_DOUBT = 0.005
 # Skew between each two axes of the gyro [rad].
 _SKEW_DOUBT = 0.005
 
 
-def doubts(width: int, *, lens_known: bool) -> Array:
-    """Sigmas (GLOBAL,) of the parameters of lens and gyro that a fit does not estimate.
+def doubts(width: int, *, lens_known: bool) -> Doubts:
+    """Sigmas of what a fit does not estimate of lens and gyro.
 
     `width` is that of the image [px].
     """
@@ -260,9 +288,7 @@ def doubts(width: int, *, lens_known: bool) -> Array:
         sigmas[model.FOCAL] = _FOCAL_DOUBT
         sigmas[model.CENTER] = _CENTER_DOUBT * width
         sigmas[model.RADIAL] = _RADIAL_DOUBT
-    else:
-        sigmas[model.RADIAL + 1] = _SECOND_DOUBT
-    return sigmas
+    return Doubts(sigmas, _TANGENTIAL_DOUBT)
 
 
 # -- Use of a calibration -------------------------------------------------------------------------

@@ -178,7 +178,7 @@ CALIBRATE = Command(
                 'choices': tuple(DISTORTION_MODELS),
                 'nargs': '?',
                 'const': _USUAL_LENS,
-                'help': 'estimate focal length, first coefficient of the '
+                'help': 'estimate focal length, radial coefficients of the '
                 'distortion of this model (default: plumb_bob) and principal point, also if the '
                 'CameraInfo has a camera matrix without distortion',
             },

@@ -253,6 +253,11 @@ class RollingShutterCamera:
             distortion=self._lens.moved(self.distortion, deviation[2:-2]),
         )
 
+    @property
+    def radial_coefficients(self) -> Array:
+        """Coefficients (3,) k1, k2, k3 of the distortion."""
+        return self._compiled.radial[:3]
+
     def _distorted(self, points: ArrayLike) -> Array:
         """Normalised points (N, 2) of raw pixels (N, 2), before the distortion is removed."""
         pixels = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
