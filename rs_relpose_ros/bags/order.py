@@ -56,15 +56,17 @@ def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
         return False
     start = int(after[0])
     passing = np.flatnonzero(after > top)
-    catching_up = after[: passing[0]] if len(passing) else after
+    never_passes = not len(passing)
+    catching_up = after if never_passes else after[: passing[0]]
     above = int(np.count_nonzero(before >= start))
     if above < _FEWEST_AFTER_RESET:
         return False
     found = above + int(np.count_nonzero(catching_up >= start))
     expected = (top - start) / period + 1.0
     # Late messages fill a gap; after a jump over all that was recorded most of the time is empty.
-    never_passes = not len(passing) and found < expected / _COVERED_TWICE
-    return never_passes or found > _COVERED_TWICE * expected
+    is_empty = never_passes and found < expected / _COVERED_TWICE
+    is_covered_twice = found > _COVERED_TWICE * expected
+    return is_empty or is_covered_twice
 
 
 def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:

@@ -309,7 +309,7 @@ class Bag:
         self._files, self._storages, metadata = open_files(path, stack)
         # Gets the topic of each message that is read, for a progress bar.
         self.on_message: Callable[[str], object] = lambda topic: None
-        counts: dict[tuple[str, str], int] = {}
+        # A topic may have messages in several files.
         self._stored: dict[tuple[str, str], StoredTopic] = {}
         for opened in self._storages:
             for topic in opened.topics:
@@ -317,12 +317,13 @@ class Bag:
                 if not ''.join(key).isprintable():
                     raise InputError(f'{path} is damaged: a topic has no printable name or type')
                 digest = topic.digest or metadata.digests.get(key, '')
-                self._stored.setdefault(key, topic._replace(digest=digest))
-                counts[key] = counts.get(key, 0) + topic.messages
+                found = topic._replace(digest=digest, messages=0)
+                whole = self._stored.setdefault(key, found)
+                count = whole.messages + topic.messages
+                self._stored[key] = whole._replace(messages=count)
         self._numbers = {key: number for number, key in enumerate(self._stored)}
-        self.topics = tuple(
-            Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items())
-        )
+        stored = [one for _, one in sorted(self._stored.items())]
+        self.topics = tuple(Topic(one.name, one.msgtype, one.messages) for one in stored)
         # Time from the first to the last message [s].
         self.duration = 0.0
         filled = [s for s in self._storages if any(topic.messages for topic in s.topics)]

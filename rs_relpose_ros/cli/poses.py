@@ -56,9 +56,11 @@ def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     for role, topic in options.topic_options(args).items():
         if topic and role in ('image', 'camera_info', 'imu'):
             words += [option_of(role), topic]
-    result, _ = calibrate_bag(make_parser('calibrate').parse_args(words))
+    arguments = make_parser('calibrate').parse_args(words)
+    result, _ = calibrate_bag(arguments)
     if not result.complete:
-        reasons = dict.fromkeys(part.remark for part in result.needed if not part.determined)
+        unknown = [part for part in result.needed if not part.determined]
+        reasons = dict.fromkeys(part.remark for part in unknown)
         raise InputError(f'the bag does not determine its calibration: {"; ".join(reasons)}')
     return file_values(folder / CALIBRATION_FILE)
 

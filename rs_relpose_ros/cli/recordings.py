@@ -210,7 +210,8 @@ def inspect_bag(args: argparse.Namespace) -> CheckReport:
     parameters = read_parameters(args.params, args.set)
     with open_bag(args.bag) as bag:
         chosen = bag.choose_topics(options.topic_options(args))
-        messages = sum(topic.count for topic in filter(None, chosen))
+        found = [topic for topic in chosen if topic is not None]
+        messages = sum(topic.count for topic in found)
         if parameters.sensor.missing() and chosen.image is not None:
             messages *= 2  # the bag is read twice
         with options.progress_bar(messages, 'message', options.bag_name(args.bag)) as bar:

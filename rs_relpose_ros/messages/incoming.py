@@ -69,7 +69,8 @@ _BASE64 = (b'/9j/', b'iVBORw0KGgo')
 def image_from_message(msg: Any) -> images.EncodedImage:
     """Image of a sensor_msgs/Image or CompressedImage; a view, checked when it is decoded."""
     data = np.frombuffer(msg.data, dtype=np.uint8)
-    origin = stamp_ns(msg.header), str(msg.header.frame_id)
+    frame_id = str(msg.header.frame_id)
+    origin = stamp_ns(msg.header), frame_id
     if hasattr(msg, 'format'):
         return images.CompressedImage(_binary(data), str(msg.format), *origin)
     encoding = str(msg.encoding)

@@ -455,8 +455,10 @@ def compressed_image_message(
     """sensor_msgs/CompressedImage: JPEG, or PNG, the only one for 16 bits."""
     kind, data = encode_pixels(pixels, png=png)
     values, name = pixels
+    bits = 8 * values.itemsize
+    order = '' if values.ndim == 2 else f'bgr{bits}'
     # The format string of image_transport.
-    text = f'{name}; {kind} compressed {"" if values.ndim == 2 else f"bgr{8 * values.itemsize}"}'
+    text = f'{name}; {kind} compressed {order}'
     return encoded_image_message(stamp_ns, frame_id, data, types, text)
 
 
@@ -466,8 +468,11 @@ def encode_pixels(pixels: Pixels, *, png: bool) -> tuple[str, bytes]:
     if name.startswith('rgb'):
         conversion = cv2.COLOR_RGBA2BGRA if name == 'rgba8' else cv2.COLOR_RGB2BGR
         values = cv2.cvtColor(values, conversion)
-    kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == 'jpeg' else []
+    kind = 'jpeg'
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    if png or values.dtype != np.uint8:
+        kind = 'png'
+        options = []
     _, data = cv2.imencode(f'.{kind}', values, options)
     return kind, data.tobytes()
 
@@ -641,8 +646,9 @@ def draw_pair(result: PairResult) -> Color:
     scale = min(1.0, _MAX_WIDTH / width)
     size = (round(scale * width), round(scale * height))
     # Two thirds of the brightness, for the contrast of the lines.
-    gray = cv2.resize(result.image2, size, interpolation=cv2.INTER_AREA) // 3 * 2
-    canvas = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    reduced = cv2.resize(result.image2, size, interpolation=cv2.INTER_AREA)
+    darkened = reduced // 3 * 2
+    canvas = np.asarray(cv2.cvtColor(darkened, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     inliers = result.pose.inliers
     if len(inliers) != len(result.matches):  # a pair without an estimate has none
         inliers = np.zeros(len(result.matches), dtype=bool)

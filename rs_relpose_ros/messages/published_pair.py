@@ -159,10 +159,11 @@ class PairStatus:
     def findings(self) -> Assessment:
         """The findings on the calibration; InputError if they contradict its state."""
         health: Assessment = self['findings']
-        if self['health'] != health.state.value:
+        legal = health.state.value
+        given = self['health']
+        if given != legal:
             raise InputError(
-                f'health of ~/pairs must be {health.state.value}, as of its findings, '
-                f'got {self["health"][:40]!r}'
+                f'health of ~/pairs must be {legal}, as of its findings, got {given[:40]!r}'
             )
         return health
 
@@ -181,8 +182,8 @@ class PairStatus:
         has_size = size == ROTATION or (size == POSE and has_direction)
         has_rotation = len(xyzw) == 4 and _is_unit(xyzw)
         has_row = len(row_times) == 1 and abs(row_times[0]) < 1.0
-        rows = np.triu_indices(size)
-        if not (has_size and has_rotation and has_row and len(upper) == len(rows[0])):
+        has_all = len(upper) == size * (size + 1) // 2
+        if not (has_size and has_rotation and has_row and has_all):
             raise InputError(
                 'image_information of ~/pairs and the other keys image_* must be of '
                 f'{POSE} or {ROTATION} unknowns, got {size}'
@@ -191,13 +192,16 @@ class PairStatus:
             t = np.full(3, math.nan)
             velocities = np.full(6, math.nan)
         H = np.zeros((size, size))
-        H[rows] = H.T[rows] = upper
+        rows = np.triu_indices(size)
+        H[rows] = upper
+        H.T[rows] = upper
         _refuse_indefinite(H)
         by_deviation = self['image_by_deviation']
-        if len(by_deviation) not in (0, size * IMAGES.size):
+        count = len(by_deviation)
+        if count not in (0, size * IMAGES.size):
             raise InputError(
                 f'image_by_deviation of ~/pairs must be {size} x {IMAGES.size} numbers, got '
-                f'{len(by_deviation)}'
+                f'{count}'
             )
         return ImageInformation(
             row_time=float(row_times[0]),
@@ -206,7 +210,7 @@ class PairStatus:
             velocities=velocities,
             information=H,
             gradient=gradient,
-            by_deviation=by_deviation.reshape(size, -1) if len(by_deviation) else None,
+            by_deviation=by_deviation.reshape(size, -1) if count else None,
         )
 
     def topics(self) -> set[str]:

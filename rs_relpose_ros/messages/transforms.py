@@ -49,7 +49,8 @@ class FrameTree:
             quaternion = [rotation.x, rotation.y, rotation.z, rotation.w]
             pose = np.eye(4)
             pose[:3, 3] = position.x, position.y, position.z
-            is_unit = abs(np.linalg.norm(quaternion) - 1.0) < 1e-2
+            length = np.linalg.norm(quaternion)
+            is_unit = abs(length - 1.0) < 1e-2
             if is_unit and np.isfinite(pose).all():
                 pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
                 # ROS 1 has names with and without a slash.

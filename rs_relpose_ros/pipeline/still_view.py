@@ -112,6 +112,7 @@ def _motion_of_cells(previous: FrameImu, current: FrameImu, sensor: Sensor) -> A
     centres = cell_centres(intrinsics.image_width, intrinsics.image_height)
     points = centres.reshape(-1, 2)
     rays, row_times = sensor.derotated(points, previous.motion)
-    rotation = current.since_previous.rotation
-    moved = sensor.project(rays @ rotation, row_times, current.motion)
-    return (moved - points).reshape(centres.shape)
+    turned = rays @ current.since_previous.rotation
+    moved = sensor.project(turned, row_times, current.motion)
+    motions = moved - points
+    return motions.reshape(centres.shape)

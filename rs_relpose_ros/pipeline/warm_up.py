@@ -147,8 +147,9 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     )
     motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
     world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
-    later = world - [0.5, 0.0, 0.0]
-    return camera.project(world), camera.project(later), camera, motion
+    points1 = camera.project(world)
+    points2 = camera.project(world - [0.5, 0.0, 0.0])
+    return points1, points2, camera, motion
 
 
 # -- The cache of the kernels: other processes fill it, so that their memory is freed -------------
