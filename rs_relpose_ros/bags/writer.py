@@ -34,6 +34,7 @@ class BagWriter:
 
     @contextmanager
     def _opened(self) -> Iterator[None]:
+        refuse_existing(self.path)  # again: it may have been created since
         with beside(self.path) as part:
             with Writer(part, version=9, storage_plugin=StoragePlugin.MCAP) as self._writer:
                 yield
