@@ -385,7 +385,8 @@ def test_the_imu_propagates_the_path_while_the_camera_stops(session):
         np.diff(true, axis=0)
     )
     assert abs(error) < 3.0 * sigmas[1] < 4.5
-    assert sigmas[1] > 3.0 * sigmas[0]
+    # The path continues from its propagated state: pairs after the gap correct the way over it.
+    assert sigmas[1] > 1.5 * sigmas[0]
 
 
 def test_reset_restarts_at_the_origin(session):

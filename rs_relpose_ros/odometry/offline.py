@@ -107,38 +107,27 @@ def odometry_into(
     prepare_folder(folder, _FILES)
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
-    observed: list[KeyframeObservations] = []
-    views: dict[int, tuple[int, float]] = {}
-
-    def pairs() -> Iterator[tuple[int, PublishedPair]]:
-        for pair in replay.pairs():
-            observed.append(KeyframeObservations.of_pair(pair))
-            given = PublishedPair.of_result(pair)
-            views[given.current_imu_ns + row_ns(given)] = pair.stamp_ns, pair.parallax
-            yield replay.read_ns, given
-
+    tracks = _Tracks(replay)
     samples = _samples(bag, topics)
     states = PublishedStates(estimator, parameters.odometry.odometry_rate)
-    live = follow(estimator, pairs(), samples, states.after)
+    live = follow(estimator, tracks.pairs(), samples, states.after)
     paths = estimator.smoothed_paths()
     closed, taken = None, list[PublishedPair]()
     if loops and paths:
-        paths, closed, taken = _with_loops(estimator, paths, views, replay, bag, topics)
+        paths, closed, taken = _with_loops(estimator, paths, tracks.views, replay, bag, topics)
     smoothed = [keyframe for path in paths for _, keyframe in path]
-    warnings = [notice.text for notice in estimator.warnings()]
     truth = read_truth(bag, topics)
     base = estimator.base or Base()  # the ground truth is that of the camera
     published = [base.camera(state) for state in states.published]
     drawn = {
-        name: path_of([base.camera(pose) for pose in trajectory], truth)
-        for name, trajectory in (('live', live), ('smoothed', smoothed))
+        'live': path_of([base.camera(pose) for pose in live], truth),
+        'smoothed': path_of([base.camera(pose) for pose in smoothed], truth),
     }
-    metrics = {
-        **_metrics(estimator, live),
-        'loops': closed,
-        'health': replay.health.state.value,
-        **{name: path.errors and path.errors.as_json() for name, path in drawn.items()},
-    }
+    metrics = _metrics(estimator, live)
+    metrics['loops'] = closed
+    metrics['health'] = replay.health.state.value
+    for name, path in drawn.items():
+        metrics[name] = path.errors and path.errors.as_json()
     if truth is not None and smoothed:
         metrics |= consistency(published, base.camera(smoothed[0]), truth)
     write_states(folder / STATES_FILE, published)
@@ -146,17 +135,40 @@ def odometry_into(
     _write_keyframes(folder / SMOOTHED_FILE, smoothed)
     if paths:
         given = [sample for _, sample in samples if isinstance(sample, ImuSample)]
-        _write_rows(folder, row_trajectory(paths, base, parameters, given, taken), rate)
-        KeyframeObservations.merged(observed).save(folder / TRACKS_FILE)
+        rows = row_trajectory(paths, base, parameters, given, taken)
+        _write_rows(folder, rows, rate)
+        tracks.save(folder / TRACKS_FILE)
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(
         live,
         smoothed,
         metrics,
-        warnings,
+        [notice.text for notice in estimator.warnings()],
         estimator.blocking_reason,
         estimator.counts['not smoothed'],
     )
+
+
+class _Tracks:
+    """The pairs of a replay as they pass by, with what files and loops need of them."""
+
+    def __init__(self, replay: Replay) -> None:
+        self._replay = replay
+        self._observed: list[KeyframeObservations] = []
+        self.views: dict[int, tuple[int, float]] = {}  # as of `loops.Views`
+
+    def pairs(self) -> Iterator[tuple[int, PublishedPair]]:
+        """All pairs with the times at which they are known [ns]."""
+        for pair in self._replay.pairs():
+            self._observed.append(KeyframeObservations.of_pair(pair))
+            given = PublishedPair.of_result(pair)
+            keyframe_ns = given.current_imu_ns + row_ns(given)
+            self.views[keyframe_ns] = pair.stamp_ns, pair.parallax
+            yield self._replay.read_ns, given
+
+    def save(self, path: Path) -> None:
+        """Write the observations of all pairs."""
+        KeyframeObservations.merged(self._observed).save(path)
 
 
 def _write_keyframes(path: Path, keyframes: Sequence[Odometry]) -> None:
@@ -483,24 +495,30 @@ def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
 
 def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> ComparedPath:
     """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
-    covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
+    covered = []
+    if truth is not None:
+        covered = [pose for pose in trajectory if truth.covers(pose.imu_ns)]
     if truth is None or len(covered) < _FEWEST_ALIGNED:
-        positions = np.array([pose.position for pose in trajectory]).reshape(-1, 3)
-        return ComparedPath([pose.imu_ns for pose in trajectory], positions)
+        all_ns = [pose.imu_ns for pose in trajectory]
+        positions = np.array([pose.position for pose in trajectory])
+        return ComparedPath(all_ns, positions.reshape(-1, 3))
+    covered_ns = [pose.imu_ns for pose in covered]
     positions = np.array([pose.position for pose in covered])
-    true = np.array([truth.position(pose.imu_ns) for pose in covered])
+    true = np.array([truth.position(imu_ns) for imu_ns in covered_ns])
     R, t, scale = aligned(positions, true)
     moved = positions @ R.T + t
+    squares = ((moved - true) ** 2).sum(axis=1)
     steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(steps)])
     relative = _relative_errors(covered, way, truth)
+    relative_error = float(np.median(relative)) if relative else math.nan
     errors = TrajectoryErrors(
-        ate_m=float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())),
+        ate_m=float(np.sqrt(squares.mean())),
         scale_error=scale - 1.0,
-        relative_translation_error_percent=100.0 * float(np.median(relative or [math.nan])),
+        relative_translation_error_percent=100.0 * relative_error,
         length_m=float(way[-1]),
     )
-    return ComparedPath([pose.imu_ns for pose in covered], moved, true, errors)
+    return ComparedPath(covered_ns, moved, true, errors)
 
 
 def _relative_errors(
