@@ -116,14 +116,18 @@ class KernelInterface:
         self._compiled: Any = functools.cache(lambda function: compiler(function.py_func))
 
         def generate(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-            types = map(context.get_value_type, (signature.return_type, *signature.args))
-            code = ir.FunctionType(next(types), types).as_pointer()
-            return builder.call(builder.inttoptr(values[0], code), values[1:])
+            returned = context.get_value_type(signature.return_type)
+            given = map(context.get_value_type, signature.args)
+            code = ir.FunctionType(returned, given).as_pointer()
+            pointer = builder.inttoptr(values[0], code)
+            return builder.call(pointer, values[1:])
 
         def typed_call(_typing: Any, address: Any, *_arguments: Any) -> Any:
             return signature.return_type(address, *signature.args), generate
 
-        names = [Parameter(f'a{k}', Parameter.POSITIONAL_ONLY) for k in range(2 + len(arguments))]
+        # Numba asks for the number of arguments, of which the typing and the address come first.
+        count = 2 + len(arguments)
+        names = [Parameter(f'a{k}', Parameter.POSITIONAL_ONLY) for k in range(count)]
         typed_call.__signature__ = Signature(names)  # type: ignore[attr-defined]
         self.call: Any = intrinsic(typed_call)
 

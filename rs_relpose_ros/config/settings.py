@@ -547,10 +547,10 @@ class GlobalShutterConfig(Settings):
 
 def pinhole_of_matrix(name: str, k: Sequence[float]) -> dict[str, Any]:
     """``fx, fy, cx, cy`` of a camera matrix, row by row; `name` is its name in an InputError."""
-    validate.array(name, k, (9,))
-    if any(k[i] != 0.0 for i in (1, 3, 6, 7)) or k[8] != 1.0:
+    fx, skew, cx, lower, fy, cy, *last_row = validate.array(name, k, (9,)).tolist()
+    if skew or lower or last_row != [0.0, 0.0, 1.0]:
         raise InputError(f'{name} must be [fx 0 cx 0 fy cy 0 0 1], got {list(k)}')
-    return {'fx': k[0], 'fy': k[4], 'cx': k[2], 'cy': k[5]}
+    return {'fx': fx, 'fy': fy, 'cx': cx, 'cy': cy}
 
 
 def _sigma(of: str, unit: str, high: float, per: str = '') -> Any:

@@ -207,10 +207,12 @@ class Estimation:
         R = self.problem.rotation
         if R is None or self.config.solver != 'auto' or self.config.refinement != 'map':
             return None
-        t = sampling.translation_direction(self.problem.observations[self.problem.valid], R)
+        valid = self.problem.observations[self.problem.valid]
+        t = sampling.translation_direction(valid, R)
         expected = self.priors.velocity.rate * t
         x = np.concatenate([t, expected, expected])
-        state = self._best(Solutions(np.ascontiguousarray(R)[None], x[None]))
+        only = Solutions(np.ascontiguousarray(R)[None], x[None])
+        state = self._best(only)
         return state if state is not None and self._share(state) > CERTAIN else None
 
     def _completed(self, state: TwoViewState) -> RelativePose:
@@ -439,12 +441,12 @@ class Estimation:
         """Rotation of each camera from the middle row to the reference row, as corrected."""
         if not self.mode.model.derotated:
             return np.eye(3), np.eye(3)
-        delay = self.problem.reference_row_time
-        turn1 = self.problem.motion1.rotations([delay])[0]
-        turn2 = self.problem.motion2.rotations([delay])[0]
-        corrected1 = so3.exp_so3(delay * state.dw1)
-        corrected2 = so3.exp_so3(delay * (state.R.T @ state.dw2))
-        return corrected1 @ turn1, corrected2 @ turn2
+        problem = self.problem
+        delay = problem.reference_row_time
+        turn1 = problem.motion1.rotations([delay])[0]
+        turn2 = problem.motion2.rotations([delay])[0]
+        dw2 = state.R.T @ state.dw2
+        return so3.exp_so3(delay * state.dw1) @ turn1, so3.exp_so3(delay * dw2) @ turn2
 
     def _result(self) -> RelativePose:
         """The refined state as a pose between the reference rows."""

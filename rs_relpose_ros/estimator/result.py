@@ -16,7 +16,7 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import rotated, skew
+from rs_relpose_ros.geometry.so3 import add, rotated, scale, skew, subtract
 from rs_relpose_ros.jit import kernel
 
 
@@ -289,14 +289,7 @@ def landmarks(
     `row_times` (2, N): of the matches, from that of the stamped row [s].
     """
     velocities = np.stack([pose.linear_velocity1, pose.linear_velocity2])
-    rays, points = _equivalent_rays(
-        pose.inliers,
-        rays,
-        row_times,
-        pose.R,
-        pose.t,
-        velocities,
-    )
+    rays, points = _equivalent_rays(pose.inliers, rays, row_times, pose.R, pose.t, velocities)
     return Landmarks(camera.project(rays[0]), camera.project(rays[1]), points)
 
 
@@ -315,28 +308,28 @@ def _equivalent_rays(
     """
     out = np.full(rays.shape, np.nan)
     points = np.full(rays.shape[1:], np.nan)
-    moved = np.empty((2, 3))
-    baseline = np.empty(3)
     for i in range(len(use)):
         if not use[i]:
             continue
-        for k in range(2):
-            for j in range(3):
-                moved[k, j] = row_times[k, i] * velocities[k, j]
-        moved_in_first = rotated(R, moved[1])
-        for j in range(3):
-            baseline[j] = t[j] + moved_in_first[j] - moved[0, j]
-        depth1, depth2, squared_sine = scaled_depths(rays[0, i], rotated(R, rays[1, i]), baseline)
+        ray1 = rays[0, i]
+        ray2 = rays[1, i]
+        moved1 = scale(row_times[0, i], velocities[0])
+        moved2 = scale(row_times[1, i], velocities[1])
+        baseline = subtract(add(t, rotated(R, moved2)), moved1)
+        depth1, depth2, squared_sine = scaled_depths(ray1, rotated(R, ray2), baseline)
         near = squared_sine > _PARALLEL and depth1 > 0.0 and depth2 > 0.0
+        # Inverse distances: 0 at infinity.
+        inverse1 = squared_sine / depth1 if near else 0.0
+        inverse2 = squared_sine / depth2 if near else 0.0
+        equivalent1 = add(ray1, scale(inverse1, moved1))
+        equivalent2 = add(ray2, scale(inverse2, moved2))
+        # The middle of the two points, which the rays give.
+        point1 = scale(depth1 / squared_sine, equivalent1)
+        point2 = add(t, scale(depth2 / squared_sine, rotated(R, equivalent2)))
+        middle = scale(0.5, add(point1, point2))
         for j in range(3):
-            # Inverse distances: 0 at infinity.
-            out[0, i, j] = rays[0, i, j] + (squared_sine / depth1 * moved[0, j] if near else 0.0)
-            out[1, i, j] = rays[1, i, j] + (squared_sine / depth2 * moved[1, j] if near else 0.0)
-        if near:
-            # The middle of the two points, which the rays give.
-            of_second = rotated(R, out[1, i])
-            for j in range(3):
-                point1 = depth1 / squared_sine * out[0, i, j]
-                point2 = t[j] + depth2 / squared_sine * of_second[j]
-                points[i, j] = 0.5 * (point1 + point2)
+            out[0, i, j] = equivalent1[j]
+            out[1, i, j] = equivalent2[j]
+            if near:
+                points[i, j] = middle[j]
     return out, points

@@ -411,7 +411,8 @@ def _of_carrier(carrier: CarrierMotion, interval: float) -> Array:
     parts = 16
     times = (np.arange(parts) + 0.5) * interval / parts
     to_both = np.vstack([interval - times, np.ones(parts)]) * interval / parts
-    correlation = np.exp(-np.abs(times[:, None] - times) / CORRELATION_TIME)
+    apart = np.abs(times[:, None] - times)
+    correlation = np.exp(-apart / CORRELATION_TIME)
     covariance: Array = carrier.acceleration**2 * to_both @ correlation @ to_both.T
     return so3.by_axes(covariance)
 

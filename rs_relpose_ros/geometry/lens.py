@@ -233,7 +233,11 @@ _MOST_ROUNDS = 12
 
 @kernel
 def distort(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -> None:
-    """Write D(x, y) and d D / d(x, y), row by row, into `out` (6,); `profile` (9,) is filled."""
+    """Write D(x, y) and d D / d(x, y), row by row, into `out` (6,); `profile` (9,) is filled.
+
+    The model of OpenCV (its documentation of the module calib3d): the radial profile R, the
+    tangential distortion p1, p2, and the thin prism s1 to s4.
+    """
     r2 = x * x + y * y
     profile_at(lens.profile, r2, lens.radial, profile)
     radial = profile[0]
@@ -244,15 +248,21 @@ def distort(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) 
     s2 = lens.sideways[3]
     s3 = lens.sideways[4]
     s4 = lens.sideways[5]
-    out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2)
-    out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4)
+    along_x = r2 + 2.0 * x * x
+    along_y = r2 + 2.0 * y * y
+    moved_x = x * radial + 2.0 * p1 * x * y + p2 * along_x
+    moved_y = y * radial + p1 * along_y + 2.0 * p2 * x * y
+    out[0] = moved_x + r2 * (s1 + r2 * s2)
+    out[1] = moved_y + r2 * (s3 + r2 * s4)
     prism_x = s1 + 2.0 * r2 * s2
     prism_y = s3 + 2.0 * r2 * s4
     mixed = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-    out[2] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x + 2.0 * x * prism_x
+    by_x = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    by_y = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    out[2] = by_x + 2.0 * x * prism_x
     out[3] = mixed + 2.0 * y * prism_x
     out[4] = mixed + 2.0 * x * prism_y
-    out[5] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x + 2.0 * y * prism_y
+    out[5] = by_y + 2.0 * y * prism_y
 
 
 @kernel
@@ -261,17 +271,16 @@ def project_points(points: Array, lens: CompiledLens) -> Array:
     out = np.empty((points.shape[0], 2))
     profile = np.empty(_PROFILE)
     values = np.empty(6)
-    for i in range(points.shape[0]):
+    for i in range(len(points)):
         x = points[i, 0]
         y = points[i, 1]
         z = points[i, 2]
+        values[0] = math.nan
+        values[1] = math.nan
         if z > _NEAREST:
             distort(x / z, y / z, lens, profile, values)
-            out[i, 0] = values[0]
-            out[i, 1] = values[1]
-        else:
-            out[i, 0] = math.nan
-            out[i, 1] = math.nan
+        out[i, 0] = values[0]
+        out[i, 1] = values[1]
     return out
 
 
@@ -318,12 +327,13 @@ def undistort_points(
             x = math.nan
             y = math.nan
             determinant = math.nan
+        of_point = inverse[i]
         out[i, 0] = x
         out[i, 1] = y
-        inverse[i, 0, 0] = v[5] / determinant
-        inverse[i, 0, 1] = -v[3] / determinant
-        inverse[i, 1, 0] = -v[4] / determinant
-        inverse[i, 1, 1] = v[2] / determinant
+        of_point[0, 0] = v[5] / determinant
+        of_point[0, 1] = -v[3] / determinant
+        of_point[1, 0] = -v[4] / determinant
+        of_point[1, 1] = v[2] / determinant
     return out, inverse
 
 
@@ -341,17 +351,19 @@ def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array
         x = normalized[i, 0]
         y = normalized[i, 1]
         scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
-        rays[i, 0] = x * scale
-        rays[i, 1] = y * scale
-        rays[i, 2] = scale
+        ray = rays[i]
+        of_ray = jacobian[i]
+        ray[0] = x * scale
+        ray[1] = y * scale
+        ray[2] = scale
         for k in range(variables):
             # m = n / |n| with n = (x, y, 1): dm = (dn - m (m . dn)) / |n|.
             dx = by_pixel[i, 0, k]
             dy = by_pixel[i, 1, k]
-            along = rays[i, 0] * dx + rays[i, 1] * dy
-            jacobian[i, 0, k] = (dx - rays[i, 0] * along) * scale
-            jacobian[i, 1, k] = (dy - rays[i, 1] * along) * scale
-            jacobian[i, 2, k] = -rays[i, 2] * along * scale
+            along = ray[0] * dx + ray[1] * dy
+            of_ray[0, k] = (dx - ray[0] * along) * scale
+            of_ray[1, k] = (dy - ray[1] * along) * scale
+            of_ray[2, k] = -ray[2] * along * scale
     return rays, jacobian
 
 
@@ -420,6 +432,12 @@ def project_rotating(
 # -- Derivatives by the lens ----------------------------------------------------------------------
 
 
+@small_kernel
+def _dot(m: Array, dn: Array) -> float:
+    """``m . dn``, where the change dn of a normalised point has no third component."""
+    return m[0] * dn[0] + m[1] * dn[1]
+
+
 @kernel
 def _bends(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -> None:
     """Write the second derivatives of D by (x, y) into `out` (2, 2, 2), component first."""
@@ -428,20 +446,24 @@ def _bends(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -
     p1 = lens.sideways[0]
     p2 = lens.sideways[1]
     r2 = x * x + y * y
-    out[0, 0, 0] = x * (3.0 * slope + bend * x * x) + 6.0 * p2
-    out[0, 0, 1] = y * (slope + bend * x * x) + 2.0 * p1
-    out[0, 1, 1] = x * (slope + bend * y * y) + 2.0 * p2
-    out[1, 1, 1] = y * (3.0 * slope + bend * y * y) + 6.0 * p1
-    # The radial and the tangential parts do not depend on the order of the indices.
-    out[1, 0, 0] = out[0, 0, 1]
-    out[1, 0, 1] = out[0, 1, 1]
+    along_x = bend * x * x
+    along_y = bend * y * y
+    # The radial and the tangential parts do not depend on the order of the three indices.
+    xxx = x * (3.0 * slope + along_x) + 6.0 * p2
+    xxy = y * (slope + along_x) + 2.0 * p1
+    xyy = x * (slope + along_y) + 2.0 * p2
+    yyy = y * (3.0 * slope + along_y) + 6.0 * p1
+    by_xx = (xxx, xxy)
+    by_xy = (xxy, xyy)
+    by_yy = (xyy, yyy)
     for c in range(2):
         square = 2.0 * lens.sideways[2 + 2 * c]
         fourth = 4.0 * lens.sideways[3 + 2 * c]
-        out[c, 0, 0] += square + fourth * (r2 + 2.0 * x * x)
-        out[c, 0, 1] += 2.0 * fourth * x * y
-        out[c, 1, 1] += square + fourth * (r2 + 2.0 * y * y)
-        out[c, 1, 0] = out[c, 0, 1]
+        mixed = by_xy[c] + 2.0 * fourth * x * y
+        out[c, 0, 0] = by_xx[c] + (square + fourth * (r2 + 2.0 * x * x))
+        out[c, 0, 1] = mixed
+        out[c, 1, 0] = mixed
+        out[c, 1, 1] = by_yy[c] + (square + fourth * (r2 + 2.0 * y * y))
 
 
 @kernel
@@ -449,28 +471,27 @@ def _write_both(
     n: Array, A: Array, profile: Array, bends: Array, by_pixel: Array, by_lens: Array, out: Array
 ) -> None:
     """Write d2n / (du dq) of one point into `out` (2, 2, 7), as in `points_by_lens`."""
-    for c in range(2):
-        toward = A[c, 0] * n[0] + A[c, 1] * n[1]
-        for u in range(2):
-            P0 = by_pixel[0, u]
-            P1 = by_pixel[1, u]
+    for u in range(2):
+        P = by_pixel[:, u]
+        along_n = _dot(n, P)
+        for c in range(2):
+            out_cu = out[c, u]
             # dJ/dq through the point that moves.
-            by_x = A[c, 0] * (bends[0, 0, 0] * P0 + bends[0, 0, 1] * P1)
-            by_x += A[c, 1] * (bends[1, 0, 0] * P0 + bends[1, 0, 1] * P1)
-            by_y = A[c, 0] * (bends[0, 1, 0] * P0 + bends[0, 1, 1] * P1)
-            by_y += A[c, 1] * (bends[1, 1, 0] * P0 + bends[1, 1, 1] * P1)
+            by_x = A[c, 0] * _dot(bends[0, 0], P) + A[c, 1] * _dot(bends[1, 0], P)
+            by_y = A[c, 0] * _dot(bends[0, 1], P) + A[c, 1] * _dot(bends[1, 1], P)
             for q in range(N_LENS):
-                out[c, u, q] = -(by_x * by_lens[0, q] + by_y * by_lens[1, q])
+                out_cu[q] = -(by_x * by_lens[0, q] + by_y * by_lens[1, q])
             # dJ/dq through the coefficient: G I + 2 G' n n^T.
-            even = A[c, 0] * P0 + A[c, 1] * P1
-            along = toward * (n[0] * P0 + n[1] * P1)
+            even = _dot(A[c], P)
+            along = _dot(A[c], n) * along_n
             for m in range(_N_RADIAL):
                 gain = profile[_GAIN + 2 * m]
-                out[c, u, 2 + m] -= gain * even + profile[_GAIN + 1 + 2 * m] * along
+                slope = profile[_GAIN + 1 + 2 * m]
+                out_cu[2 + m] -= gain * even + slope * along
             # A longer focal length makes the step of a pixel smaller: A (d2d / (du dq)).
-            out[c, u, 0] -= by_pixel[c, u]
+            out_cu[0] -= P[c]
             if u == 1:
-                out[c, u, 1] -= by_pixel[c, u]
+                out_cu[1] -= P[c]
 
 
 @kernel
@@ -503,21 +524,18 @@ def points_by_lens(
         profile_at(lens.profile, x * x + y * y, lens.radial, profile)
         _bends(x, y, lens, profile, bends)
         for c in range(2):
-            by_lens[i, c, 0] = -(A[c, 0] * distorted[i, 0] + A[c, 1] * distorted[i, 1])
-            by_lens[i, c, 1] = -A[c, 1] * distorted[i, 1]
+            of_c = by_lens[i, c]
+            toward = _dot(A[c], points[i])
+            of_c[0] = -_dot(A[c], distorted[i])
+            of_c[1] = -A[c, 1] * distorted[i, 1]
             for m in range(_N_RADIAL):
-                by_lens[i, c, 2 + m] = -profile[_GAIN + 2 * m] * (A[c, 0] * x + A[c, 1] * y)
+                of_c[2 + m] = -profile[_GAIN + 2 * m] * toward
             for u in range(2):
-                by_pixel[i, c, u] = A[c, u] / focal[u]
-                by_lens[i, c, 2 + _N_RADIAL + u] = -by_pixel[i, c, u]
+                step = A[c, u] / focal[u]
+                by_pixel[i, c, u] = step
+                of_c[2 + _N_RADIAL + u] = -step
         _write_both(points[i], A, profile, bends, by_pixel[i], by_lens[i], by_both[i])
     return ByLens(points, by_pixel, by_lens, by_both)
-
-
-@small_kernel
-def _dot(m: Array, dn: Array) -> float:
-    """``m . dn``, where the change dn of a normalised point has no third component."""
-    return m[0] * dn[0] + m[1] * dn[1]
 
 
 @kernel

@@ -59,7 +59,9 @@ def column(rows: Array, first: int, i: int) -> Vector:
 @small_kernel
 def write_column(v: Vector, rows: Array, first: int, i: int) -> None:
     """Write a vector into column i of `rows` (n, m), from row `first` on."""
-    rows[first, i], rows[first + 1, i], rows[first + 2, i] = v
+    rows[first, i] = v[0]
+    rows[first + 1, i] = v[1]
+    rows[first + 2, i] = v[2]
 
 
 @small_kernel
@@ -89,21 +91,13 @@ def copy_matrix(source: Array, out: Array) -> None:
 @small_kernel
 def rotated(R: Array, v: Vector | Array) -> Vector:
     """``R v`` with any matrix R (3, 3)."""
-    return (
-        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
-        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
-        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
-    )
+    return (dot(R[0], v), dot(R[1], v), dot(R[2], v))
 
 
 @small_kernel
 def rotated_back(R: Array, v: Vector | Array) -> Vector:
     """``R^T v`` with any matrix R (3, 3)."""
-    return (
-        R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
-        R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
-        R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2],
-    )
+    return (dot(R[:, 0], v), dot(R[:, 1], v), dot(R[:, 2], v))
 
 
 @kernel
@@ -119,10 +113,9 @@ def tangent_basis(t: Array) -> Array:
     axis[k] = 1.0
     u = cross(t, axis)
     length = norm(u)
-    basis[0, 0] = u[0] / length
-    basis[1, 0] = u[1] / length
-    basis[2, 0] = u[2] / length
-    basis[0, 1], basis[1, 1], basis[2, 1] = cross(t, basis[:, 0])
+    for i in range(3):
+        basis[i, 0] = u[i] / length
+    write_column(cross(t, basis[:, 0]), basis, 0, 1)
     return basis
 
 
@@ -141,16 +134,19 @@ def _skew_series(v: Array, a: float, b: float) -> Array:
     x = v[0]
     y = v[1]
     z = v[2]
+    xy = b * x * y
+    xz = b * x * z
+    yz = b * y * z
     out = np.empty((3, 3))
     out[0, 0] = 1.0 - b * (y * y + z * z)
     out[1, 1] = 1.0 - b * (x * x + z * z)
     out[2, 2] = 1.0 - b * (x * x + y * y)
-    out[0, 1] = b * x * y - a * z
-    out[1, 0] = b * x * y + a * z
-    out[0, 2] = b * x * z + a * y
-    out[2, 0] = b * x * z - a * y
-    out[1, 2] = b * y * z - a * x
-    out[2, 1] = b * y * z + a * x
+    out[0, 1] = xy - a * z
+    out[1, 0] = xy + a * z
+    out[0, 2] = xz + a * y
+    out[2, 0] = xz - a * y
+    out[1, 2] = yz - a * x
+    out[2, 1] = yz + a * x
     return out
 
 
@@ -167,26 +163,28 @@ def log_so3(rotation: Array) -> Array:
     # The way through the quaternion is exact near 0 and near pi, where the trace formula loses
     # digits.
     q = np.empty(4)
-    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    R = rotation
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
         s = math.sqrt(trace + 1.0) * 2.0
         q[3] = 0.25 * s
-        q[0] = (rotation[2, 1] - rotation[1, 2]) / s
-        q[1] = (rotation[0, 2] - rotation[2, 0]) / s
-        q[2] = (rotation[1, 0] - rotation[0, 1]) / s
+        q[0] = (R[2, 1] - R[1, 2]) / s
+        q[1] = (R[0, 2] - R[2, 0]) / s
+        q[2] = (R[1, 0] - R[0, 1]) / s
     else:
         i = 0
-        if rotation[1, 1] > rotation[0, 0]:
+        if R[1, 1] > R[0, 0]:
             i = 1
-        if rotation[2, 2] > rotation[i, i]:
+        if R[2, 2] > R[i, i]:
             i = 2
         j = (i + 1) % 3
         k = (i + 2) % 3
-        s = math.sqrt(max(rotation[i, i] - rotation[j, j] - rotation[k, k] + 1.0, 0.0)) * 2.0
+        largest = R[i, i] - R[j, j] - R[k, k] + 1.0
+        s = math.sqrt(max(largest, 0.0)) * 2.0
         q[i] = 0.25 * s
-        q[3] = (rotation[k, j] - rotation[j, k]) / s
-        q[j] = (rotation[j, i] + rotation[i, j]) / s
-        q[k] = (rotation[k, i] + rotation[i, k]) / s
+        q[3] = (R[k, j] - R[j, k]) / s
+        q[j] = (R[j, i] + R[i, j]) / s
+        q[k] = (R[k, i] + R[i, k]) / s
     if q[3] < 0.0:
         q = -q
     sine = norm(q)  # `norm` takes the first three elements: x, y, z
@@ -204,16 +202,18 @@ def left_jacobian_so3(v: Array) -> Array:
     if theta2 < 1e-8:
         return _skew_series(v, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0)
     theta = math.sqrt(theta2)
-    return _skew_series(
-        v, (1.0 - math.cos(theta)) / theta2, (theta - math.sin(theta)) / (theta2 * theta)
-    )
+    a = (1.0 - math.cos(theta)) / theta2
+    b = (theta - math.sin(theta)) / (theta2 * theta)
+    return _skew_series(v, a, b)
 
 
 @kernel
 def multiply(A: Array, B: Array, out: Array) -> None:
     """Write the product ``A B`` (3, 3) into `out`; the matrices are too small for BLAS."""
     for i in range(3):
-        out[i, 0], out[i, 1], out[i, 2] = rotated_back(B, A[i])  # row of A B: B^T a_i
+        row = rotated_back(B, A[i])  # of A B: B^T a_i
+        for j in range(3):
+            out[i, j] = row[j]
 
 
 @register_jitable
@@ -242,7 +242,7 @@ def aligning_rotation(correlation: Array) -> Array:
     SciPy's ``align_vectors`` warns if the rotation about one axis is arbitrary.
     """
     u, _, vt = np.linalg.svd(correlation)
-    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)  # no reflection
     return np.ascontiguousarray(u @ vt)
 
 

@@ -10,10 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
+
+Stamps = NDArray[np.int64]  # [ns]
 
 # Nanoseconds in a second. [derived: definition]
 NANOSECONDS = 1_000_000_000
@@ -71,7 +74,8 @@ def correlation_of_steps(steps: Array) -> float:
     both = whole[1:] & whole[:-1]
     first = deviations[:-1][both]
     second = deviations[1:][both]
-    return float(first @ second) / max(0.5 * float(first @ first + second @ second), 1e-24)
+    variance = 0.5 * float(first @ first + second @ second)
+    return float(first @ second) / max(variance, 1e-24)
 
 
 def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
@@ -100,11 +104,11 @@ class ImageClock:
 
         `interval_ns` is T of the frame, and None if it is not known: T_ref is used then.
         """
-        offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure(interval_ns))
+        exposure = self.exposure(interval_ns)
+        offset = self.time_offset + exposure_shift(self.stamp_exposure, exposure)
         if interval_ns is not None:
-            offset += self.offset_per_interval * (
-                interval_ns / NANOSECONDS - self.reference_interval
-            )
+            longer = interval_ns / NANOSECONDS - self.reference_interval
+            offset += self.offset_per_interval * longer
         return stamp_ns + to_nanoseconds(offset)
 
     def exposure(self, interval_ns: int | None = None) -> float:
@@ -119,10 +123,8 @@ class ImageClock:
         reference = self.reference_ns(stamp_ns, interval_ns)
         earliest, latest = self.camera.row_time_span
         half = to_nanoseconds(0.5 * self.exposure(interval_ns))
-        return (
-            reference + to_nanoseconds(earliest) - half,
-            reference + to_nanoseconds(latest) + half,
-        )
+        begin = reference + to_nanoseconds(earliest) - half
+        return begin, reference + to_nanoseconds(latest) + half
 
 
 class Sensor(NamedTuple):

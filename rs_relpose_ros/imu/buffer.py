@@ -10,7 +10,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.errors import InputError
@@ -18,12 +17,11 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.gyro import integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
-from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps, to_nanoseconds
 from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 
-Stamps = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 
@@ -40,6 +38,10 @@ _ROOM = 256
 _EXCESS = 10
 
 
+# Time before all stamps [ns]. [derived: the smallest integer of 64 bits]
+_NEVER_NS = int(np.iinfo(np.int64).min)
+
+
 class Coverage(Enum):
     """Whether the samples cover an interval."""
 
@@ -51,15 +53,12 @@ class Coverage(Enum):
 class Series:
     """Stamped vectors (K, width) in order, in growing arrays; steps above `gap_ns` are gaps."""
 
-    def __init__(
-        self,
-        gap_ns: int,
-        width: int = 3,
-    ) -> None:
+    def __init__(self, gap_ns: int, width: int = 3) -> None:
         self._gap_ns = gap_ns
         self._stamps = np.empty(_ROOM, dtype=np.int64)
         self._values = np.empty((_ROOM, width))
-        self._start = self._end = 0
+        self._start = 0
+        self._end = 0
 
     @property
     def stamps(self) -> Stamps:
@@ -76,11 +75,7 @@ class Series:
         """The last stamp; None without any."""
         return int(self._stamps[self._end - 1]) if self._end > self._start else None
 
-    def insert(
-        self,
-        stamp_ns: int,
-        value: tuple[float, ...] | None,
-    ) -> bool:
+    def insert(self, stamp_ns: int, value: tuple[float, ...] | None) -> bool:
         """Insert in order; False for no value, and for a stamp that exists already."""
         if value is None:
             return False
@@ -97,10 +92,11 @@ class Series:
             self._start = 0
             self._end = len(stamps)
         at = self._start + position
-        self._stamps[at + 1 : self._end + 1] = self._stamps[at : self._end]
-        self._values[at + 1 : self._end + 1] = self._values[at : self._end]
-        self._stamps[at] = stamp_ns
-        self._values[at] = value
+        later = slice(at, self._end)
+        moved = slice(at + 1, self._end + 1)
+        for column, new in ((self._stamps, stamp_ns), (self._values, value)):
+            column[moved] = column[later]
+            column[at] = new
         self._end += 1
         return True
 
@@ -110,11 +106,7 @@ class Series:
         if keep > 0:
             self._start += keep
 
-    def between(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> tuple[Stamps, Array] | None:
+    def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
         """Stamps (K,), values (K, width), borders interpolated; None if not covered."""
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
@@ -123,9 +115,9 @@ class Series:
         first = self.number_until(start_ns)
         last = int(self.stamps.searchsorted(end_ns))
         stamps = np.concatenate([[start_ns], self.stamps[first:last], [end_ns]])
-        begin = self._interpolated(start_ns)[None]
-        end = self._interpolated(end_ns)[None]
-        return stamps, np.concatenate([begin, self.values[first:last], end])
+        begin = self._interpolated(start_ns)
+        end = self._interpolated(end_ns)
+        return stamps, np.vstack([begin, self.values[first:last], end])
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps = self.stamps
@@ -134,34 +126,27 @@ class Series:
         if stamps[after] == at_ns:
             return value
         before = self.values[after - 1]
-        step = stamps[after] - stamps[after - 1]
-        fraction = (at_ns - stamps[after - 1]) / step
+        before_ns = stamps[after - 1]
+        fraction = (at_ns - before_ns) / (stamps[after] - before_ns)
         return np.asarray(before + fraction * (value - before))
 
-    def enclosing(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> Stamps:
+    def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
         """Stamps within an interval, and one on either side of it."""
         first = max(self.number_until(start_ns) - 1, 0)
-        return self.stamps[first : int(self.stamps.searchsorted(end_ns)) + 1]
+        last = int(self.stamps.searchsorted(end_ns))
+        return self.stamps[first : last + 1]
 
     def number_until(self, at_ns: int) -> int:
         """Number of samples up to a time, that time included."""
         return int(self.stamps.searchsorted(at_ns, 'right'))
 
-    def coverage(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> Coverage:
+    def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
         stamps = self.stamps
         if len(stamps) == 0:
             return Coverage.NOT_YET
-        around = self.enclosing(start_ns, end_ns)
-        if start_ns < stamps[0] or (around[1:] - around[:-1] > self._gap_ns).any():
+        steps = np.diff(self.enclosing(start_ns, end_ns))
+        if start_ns < stamps[0] or (steps > self._gap_ns).any():
             return Coverage.NEVER
         return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
 
@@ -230,10 +215,12 @@ def force_fault(forces: Array) -> str:
     size = np.abs(forces)
     if size.max() < _LEAST_RANGE * STANDARD_GRAVITY:
         return ''
-    end = np.maximum(_AT_THE_END * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY)
+    largest = size.max(axis=0)
+    end = np.maximum(_AT_THE_END * largest, _LEAST_RANGE * STANDARD_GRAVITY)
     equal = (forces[1:] == forces[:-1]) & (size[1:] >= end)
-    clipped = (equal[1:] & equal[:-1]).any()
-    return f'the accelerometer is clipped at {size.max():.3g} m/s^2' if clipped else ''
+    if not (equal[1:] & equal[:-1]).any():
+        return ''
+    return f'the accelerometer is clipped at {largest.max():.3g} m/s^2'
 
 
 class ImuInterval(NamedTuple):
@@ -314,47 +301,32 @@ class ImuSamples:
         for series in (self.gyro, self.force, self._down):
             series.prune(before_ns)
 
-    def complete(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> bool:
+    def complete(self, start_ns: int, end_ns: int) -> bool:
         """Whether all samples between two times seem to have arrived."""
         until_ns = self.both_until_ns
         if until_ns is None or until_ns < end_ns:
             return False
         for series in (self.gyro, self.force):
             steps = np.diff(series.enclosing(start_ns, end_ns))
-            if not len(steps) or steps.max() > _LATE_STEP * np.median(np.diff(series.stamps)):
+            usual = np.median(np.diff(series.stamps))
+            if not len(steps) or steps.max() > _LATE_STEP * usual:
                 return False
         return True
 
-    def between(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> ImuInterval | None:
+    def between(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Samples of both sensors from one time to a later one; None if one has a gap."""
-        if (
-            end_ns <= start_ns
-            or (gyro := self.gyro.between(start_ns, end_ns)) is None
-            or (force := self.force.between(start_ns, end_ns)) is None
-        ):
+        if end_ns <= start_ns:
             return None
-        return ImuInterval(
-            *integration.at_common_times(
-                (gyro[0] - start_ns) / NANOSECONDS,
-                gyro[1],
-                (force[0] - start_ns) / NANOSECONDS,
-                force[1],
-            )
-        )
+        gyro = self.gyro.between(start_ns, end_ns)
+        force = self.force.between(start_ns, end_ns)
+        if gyro is None or force is None:
+            return None
+        rate_times = (gyro[0] - start_ns) / NANOSECONDS
+        force_times = (force[0] - start_ns) / NANOSECONDS
+        common = integration.at_common_times(rate_times, gyro[1], force_times, force[1])
+        return ImuInterval(*common)
 
-    def up_to(
-        self,
-        end_ns: int,
-        seconds: float,
-    ) -> ImuInterval | None:
+    def up_to(self, end_ns: int, seconds: float) -> ImuInterval | None:
         """Samples of both sensors of at most the last `seconds` before a time, if any."""
         if self.both_until_ns is None:
             return None
@@ -379,7 +351,8 @@ class ImuBuffer(ImuSamples):
         super().clear()
         self._filter = filters.GravityFilter(self.config)
         self._bias = filters.BiasTracker(self.config)
-        self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
+        self._filtered_ns = _NEVER_NS
+        self._pruned_ns = _NEVER_NS
 
     def add(self, sample: ImuSample) -> bool:
         """Store a sample, or False for a duplicate; InputError if a value is not finite."""
@@ -418,21 +391,12 @@ class ImuBuffer(ImuSamples):
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
-    def covers(
-        self,
-        start_ns: int,
-        end_ns: int,
-        exposure: float,
-    ) -> bool:
+    def covers(self, start_ns: int, end_ns: int, exposure: float) -> bool:
         """Whether the gyro covers the exposures [s] of all rows between two times."""
         half = to_nanoseconds(0.5 * exposure)
         return self.gyro.coverage(start_ns - half, end_ns + half) is Coverage.AVAILABLE
 
-    def recent_forces(
-        self,
-        until_ns: int,
-        duration_ns: int | None = None,
-    ) -> Array:
+    def recent_forces(self, until_ns: int, duration_ns: int | None = None) -> Array:
         """Specific forces (K, 3) [m/s^2] up to a time, IMU frame."""
         if duration_ns is None:
             # Half of the buffer is there, whenever it is asked for.
@@ -445,11 +409,7 @@ class ImuBuffer(ImuSamples):
         self._run_filters(at_ns)
         return self._bias.estimate(at_ns)
 
-    def rotation(
-        self,
-        start_ns: int,
-        end_ns: int,
-    ) -> tuple[Array, Array]:
+    def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """``R_start^T R_end`` (3, 3) in the IMU frame, covariance: see `integrate_rotation`."""
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
         return integration.integrate_rotation(
@@ -503,18 +463,22 @@ class ImuBuffer(ImuSamples):
         if first < last:
             stamps = self.gyro.stamps[first:last]
             rates = self.gyro.values[first:last]
-            # The latest specific forces not after these stamps; NaN if older than a gap.
-            forces = np.full((len(stamps), 3), np.nan)
-            force_stamps = self.force.stamps
-            if len(force_stamps):
-                k = np.searchsorted(force_stamps, stamps, side='right') - 1
-                fresh = (k >= 0) & (stamps - force_stamps[k] <= self._gap_ns)
-                forces[fresh] = self.force.values[k[fresh]]
+            forces = self._forces_at(stamps)
             self._bias.run(stamps, rates, forces)
             # With the configured bias only: the gravity filter estimates the rest.
             if self.config.gravity_filter == 'complementary':
                 self._filter.run(stamps, rates - self._configured_bias, forces)
             self._filtered_ns = int(stamps[-1])
+
+    def _forces_at(self, stamps: Stamps) -> Array:
+        """The latest specific forces (K, 3) not after these stamps; NaN if older than a gap."""
+        forces = np.full((len(stamps), 3), np.nan)
+        known = self.force.stamps
+        if len(known):
+            k = np.searchsorted(known, stamps, side='right') - 1
+            fresh = (k >= 0) & (stamps - known[k] <= self._gap_ns)
+            forces[fresh] = self.force.values[k[fresh]]
+        return forces
 
 
 def frame_imu(
@@ -555,22 +519,11 @@ def frame_imu(
                 since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
             )
     sigma = None if gravity is None else gravity.sigma
-    imu = FrameImu(
-        motion,
-        sigma,
-        reference_ns,
-        since_previous,
-        no_force,
-    )
+    imu = FrameImu(motion, sigma, reference_ns, since_previous, no_force)
     if no_force or readout is None or gravity is None:
         return imu
     force = _mean_force(motion, readout[0] - reference_ns, readout[1] @ R_cam_imu.T)
-    return replace(
-        imu,
-        force=force,
-        at_rest=gravity.length,
-        at_rest_sigma=gravity.length_sigma,
-    )
+    return replace(imu, force=force, at_rest=gravity.length, at_rest_sigma=gravity.length_sigma)
 
 
 def _rows_motion(
@@ -608,11 +561,7 @@ def _slice(
     )
 
 
-def _mean_force(
-    motion: FrameMotion,
-    times_ns: Stamps,
-    forces: Array,
-) -> Array:
+def _mean_force(motion: FrameMotion, times_ns: Stamps, forces: Array) -> Array:
     """Mean (3,) of specific forces (K, 3), in the axes of the stamped row.
 
     `times_ns` (K,): of the forces, from the stamped row on. Forces are linear between samples:

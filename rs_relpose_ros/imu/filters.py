@@ -23,15 +23,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, norm, rotated, STANDARD_GRAVITY
-from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.geometry.timing import Stamps, to_nanoseconds
 from rs_relpose_ros.jit import kernel, small_kernel
-
-Stamps = NDArray[np.int64]
 
 # -- Bias of the gyro, measured at rest -----------------------------------------------------------
 #
@@ -300,10 +297,10 @@ class GravityFilter:
         # The part of the mean residual above the noise is lasting and biases the direction.
         residual = self._state.residual - up * (up @ self._state.residual)
         of_noise = 2.0 * self._noise.acceleration / STANDARD_GRAVITY**2
-        unexplained = max(
-            float(residual @ residual) - of_noise * _CORRELATION_TIME / _LASTING, 0.0
-        )
-        variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0) ** 2
+        expected = of_noise * _CORRELATION_TIME / _LASTING
+        unexplained = max(float(residual @ residual) - expected, 0.0)
+        remembered = min(_LASTING / self._config.gravity_time_constant, 1.0)
+        variance += unexplained * remembered**2
         length, length_variance = self._state.length
         return GravityEstimate(
             -up,
@@ -328,9 +325,11 @@ class GravityFilter:
         state = self._state
         state.up[:] = forces[first] / length
         state.residual[:] = 0.0
+        variance = _direction_variance(length, self._noise.acceleration)
         for covariance in (state.covariance, state.errors):
-            covariance[:3, 3:] = covariance[3:, :3] = 0.0
-            covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
+            covariance[:3, 3:] = 0.0
+            covariance[3:, :3] = 0.0
+            covariance[:3, :3] = variance * np.eye(3)
         self.stamp_ns = int(stamps_ns[first])
         self._rate = rates[first].copy()
         return first + 1
@@ -489,7 +488,9 @@ def _gain(
     _add_product(H, PHt, S)
     _mirror(S)
     for i in range(3):  # S^-1 = adj S / det S
-        adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
+        row = cross(S[(i + 1) % 3], S[(i + 2) % 3])
+        for j in range(3):
+            adjugate[i, j] = row[j]
     determinant = dot(S[0], adjugate[0])
     K = np.zeros((6, 3))
     _add_product(PHt, adjugate, K)
@@ -517,11 +518,13 @@ def _add_product(
     out: Array,
 ) -> None:
     """``out <- out + A B``, term by term in this order; BLAS costs more for small matrices."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+    rows, columns = out.shape
+    for i in range(rows):
+        row = A[i]
+        for j in range(columns):
             total = out[i, j]
-            for k in range(A.shape[1]):
-                total += A[i, k] * B[k, j]
+            for k in range(len(row)):
+                total += row[k] * B[k, j]
             out[i, j] = total
 
 
@@ -532,11 +535,14 @@ def _write_product_transposed(
     out: Array,
 ) -> None:
     """``out <- A B^T``; `out` is another array than A and B."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+    rows, columns = out.shape
+    for i in range(rows):
+        row = A[i]
+        for j in range(columns):
+            other = B[j]
             total = 0.0
-            for k in range(A.shape[1]):
-                total += A[i, k] * B[j, k]
+            for k in range(len(row)):
+                total += row[k] * other[k]
             out[i, j] = total
 
 
@@ -569,8 +575,7 @@ def agreed_gravity(
     if measured is None:
         return own
     own = replace(own, length=measured.length, length_sigma=measured.length_sigma)
-    apart = math.atan2(
-        float(np.linalg.norm(np.cross(own.direction, measured.direction))),
-        float(own.direction @ measured.direction),
-    )
-    return own if apart <= _OWN_GATE * math.hypot(own.sigma, measured.sigma) else measured
+    across = np.linalg.norm(np.cross(own.direction, measured.direction))
+    apart = math.atan2(across, own.direction @ measured.direction)
+    limit = _OWN_GATE * math.hypot(own.sigma, measured.sigma)
+    return own if apart <= limit else measured

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
@@ -15,10 +14,8 @@ from rs_relpose_ros.geometry import Array, so3, validate
 from rs_relpose_ros.geometry.gyro import integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import skew
-from rs_relpose_ros.geometry.timing import seconds_between
+from rs_relpose_ros.geometry.timing import seconds_between, Stamps
 from rs_relpose_ros.jit import kernel
-
-Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,39 +106,39 @@ class FrameImu:
     at_rest_sigma: float = np.nan
 
 
-def mean_rates(
-    stamps_ns: Stamps,
-    rates: Array,
-    at_ns: Stamps,
-    width: float | Array,
-) -> Array:
+def mean_rates(stamps_ns: Stamps, rates: Array, at_ns: Stamps, width: float | Array) -> Array:
     """Exact means (N, 3) of rates (K, 3), linear between samples, over `width` [s] about `at_ns`.
 
     Beyond the samples, the mean is taken over the part of the interval which they cover.
     """
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
-    steps = np.diff(seconds)
-    areas = 0.5 * (rates[1:] + rates[:-1]) * steps[:, None]
-    integral = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
-    slopes = np.diff(rates, axis=0) / steps[:, None]
+    steps = np.diff(seconds)[:, None]
+    integral = _integral(steps, rates)
+    slopes = np.diff(rates, axis=0) / steps
 
     def integral_at(times: Array) -> Array:
         k = np.searchsorted(seconds, times, side='right') - 1
         k = np.clip(k, 0, len(steps) - 1)
         since = (times - seconds[k])[:, None]
-        return np.asarray(integral[k] + since * (rates[k] + 0.5 * since * slopes[k]))
+        mean_rate = rates[k] + 0.5 * since * slopes[k]
+        return np.asarray(integral[k] + since * mean_rate)
 
     middle = (at_ns - stamps_ns[0]) * 1e-9
-    begin = np.clip(middle - 0.5 * width, 0.0, seconds[-1])
-    end = np.clip(middle + 0.5 * width, 0.0, seconds[-1])
-    return np.asarray((integral_at(end) - integral_at(begin)) / (end - begin)[:, None])
+    half = 0.5 * width
+    begin = np.clip(middle - half, 0.0, seconds[-1])
+    end = np.clip(middle + half, 0.0, seconds[-1])
+    turned = integral_at(end) - integral_at(begin)
+    return np.asarray(turned / (end - begin)[:, None])
+
+
+def _integral(steps: Array, values: Array) -> Array:
+    """Integral (K, 3) up to each sample of values (K, 3), linear over `steps` (K - 1, 1) [s]."""
+    areas = 0.5 * (values[1:] + values[:-1]) * steps
+    return np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
 
 
 @kernel
-def _integrate(
-    seconds: Array,
-    rates: Array,
-) -> tuple[Array, Array, Array]:
+def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
     """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
 
     An error dw of the rate of step k rotates the result by ``L_k dw dt`` on the left (in the start
@@ -158,9 +155,10 @@ def _integrate(
         turn = so3.step_rotation(rates[k], rates[k + 1], dt)
         so3.multiply(rotations[k], so3.left_jacobian_so3(turn), L)
         for i in range(3):
+            row = L[i]
             for j in range(3):
-                derivative[i, j] += L[i, j] * dt
-                noise[i, j] += so3.dot(L[i], L[j]) * dt
+                derivative[i, j] += row[j] * dt
+                noise[i, j] += so3.dot(row, L[j]) * dt
     return rotations[-1], derivative, noise
 
 
@@ -226,46 +224,23 @@ def preintegrate(
     alpha = twice[-1] + 0.5 * duration**2 * gravity
 
     by_gravity = np.vstack([0.5 * duration**2 * np.eye(3), duration * np.eye(3)])
-    by_bias, by_rates = _error_derivatives(
-        seconds,
-        rates,
-        rotations,
-        once,
-        twice,
-    )
+    by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
     crossed = duration**2 / 2.0
     of_noise = so3.by_axes(np.array([[duration**3 / 3.0, crossed], [crossed, duration]]))
     by_arm = _by_lever_arm(duration, rotations[-1], rates)
-    squared_steps = np.einsum(
-        'k,kij,klj->il',
-        1.0 / steps,
-        by_rates,
-        by_rates,
-    )
-    covariance = (
-        config.accel_noise_density**2 * of_noise
-        + config.accel_bias_sigma**2 * by_bias @ by_bias.T
-        + by_gravity @ gravity_covariance @ by_gravity.T
-        + config.gyro_noise_density**2 * squared_steps
-        + bias_sigma**2 * by_gyro @ by_gyro.T
-        + config.imu_position_sigma**2 * by_arm @ by_arm.T
-    )
-    return InertialMotion(
-        alpha,
-        beta,
-        duration,
-        covariance,
-        lever_arm,
-    )
+    squared_steps = np.einsum('k,kij,klj->il', 1.0 / steps, by_rates, by_rates)
+    covariance = config.accel_noise_density**2 * of_noise
+    covariance += config.accel_bias_sigma**2 * by_bias @ by_bias.T
+    covariance += by_gravity @ gravity_covariance @ by_gravity.T
+    covariance += config.gyro_noise_density**2 * squared_steps
+    covariance += bias_sigma**2 * by_gyro @ by_gyro.T
+    covariance += config.imu_position_sigma**2 * by_arm @ by_arm.T
+    return InertialMotion(alpha, beta, duration, covariance, lever_arm)
 
 
-def _by_lever_arm(
-    duration: float,
-    R: Array,
-    rates: Array,
-) -> Array:
+def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
     """Derivatives (6, 3) of the camera's (alpha, beta) by the lever arm p.
 
     With the pose (R, b t) of the second frame in the first one::
@@ -278,21 +253,17 @@ def _by_lever_arm(
     return np.vstack([duration * swing1 + np.eye(3) - R, swing1 - swing2])
 
 
-def force_integrals(
-    steps: Array,
-    forces: Array,
-) -> tuple[Array, Array]:
+def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
     """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
-    before = forces[:-1]
-    after = forces[1:]
-    gained = 0.5 * (after + before) * steps[:, None]
-    once = np.vstack([np.zeros(3), np.cumsum(gained, axis=0)])
-    curved = (2.0 * before + after) * (steps**2 / 6.0)[:, None]
-    moved = once[:-1] * steps[:, None] + curved
+    steps = steps[:, None]
+    once = _integral(steps, forces)
+    curved = (2.0 * forces[:-1] + forces[1:]) * (steps**2 / 6.0)
+    moved = once[:-1] * steps + curved
     return once, np.vstack([np.zeros(3), np.cumsum(moved, axis=0)])
 
 
 # Cross-product matrix of each axis, in a row: ``skew(v) = (v @ _SKEW).reshape(3, 3)``.
+# [derived: the definition of the cross product]
 _SKEW = np.array([skew(axis).ravel() for axis in np.eye(3)])
 
 
@@ -306,15 +277,17 @@ def _error_derivatives(
     half_turns = 0.25 * steps[:, None] * (rates[1:] + rates[:-1])
     halfway = rotations[:-1] @ Rotation.from_rotvec(half_turns).as_matrix()
     # A bias rotates with the IMU.
-    by_bias = np.vstack(
-        [np.einsum('k,kij->ij', left * steps, halfway), np.einsum('k,kij->ij', steps, halfway)]
-    )
-    # A rotation theta in step k rotates all later forces: by -[F]x theta, F being their integral.
+    alpha_by_bias = np.einsum('k,kij->ij', left * steps, halfway)
+    beta_by_bias = np.einsum('k,kij->ij', steps, halfway)
+    by_bias = np.vstack([alpha_by_bias, beta_by_bias])
+    # A rotation theta in step k rotates all later forces: by -[F]x theta with their integral F.
     halfway_once = 0.5 * (once[1:] + once[:-1])
     halfway_twice = 0.5 * (twice[1:] + twice[:-1])
     later = once[-1] - halfway_once
     later_way = twice[-1] - halfway_twice - halfway_once * left[:, None]
-    by_rotation = -np.hstack([(force @ _SKEW).reshape(-1, 3, 3) for force in (later_way, later)])
+    alpha_by_rotation = (later_way @ _SKEW).reshape(-1, 3, 3)
+    beta_by_rotation = (later @ _SKEW).reshape(-1, 3, 3)
+    by_rotation = -np.hstack([alpha_by_rotation, beta_by_rotation])
     return by_bias, by_rotation @ halfway * steps[:, None, None]
 
 

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.timing import Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.tracking.images import Image
 from rs_relpose_ros.tracking.still import (
     cell_centres,
     COLUMNS,
-    Flags,
     free_of,
     ROWS,
     StillParts,
@@ -58,10 +57,10 @@ class StillView:
         if self._skipped is not None:
             since = self._skipped.joined(since)
         imu = replace(imu, since_previous=since)
-        change = self._parts.add(stamp_ns, image, _motion_of_cells(previous, imu, sensor))
-        self.static = change.static
-        self._repeated.append(change.repeated)
-        if change.repeated:
+        repeated = self._parts.add(stamp_ns, image, _motion_of_cells(previous, imu, sensor))
+        self.static = self._parts.static()
+        self._repeated.append(repeated)
+        if repeated:
             self._skipped = since
             return None
         self._skipped = None

@@ -3,15 +3,14 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Indices
 from rs_relpose_ros.geometry.so3 import copy_vector, cross, dot, Vector
 from rs_relpose_ros.jit import kernel, small_kernel
 
 
 @kernel
-def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
+def lu_factor(A: Array, pivots: Indices) -> float:
     """Factor `A` (n, n) into L U in place, with row pivoting; returns the determinant.
 
     The diagonal receives the reciprocals of the pivots. A pivot of exactly zero is replaced by a
@@ -30,39 +29,46 @@ def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
             if abs(A[i, k]) > abs(A[pivot, k]):
                 pivot = i
         pivots[k] = pivot
+        upper = A[k]
         if pivot != k:
+            other = A[pivot]
             for j in range(n):
-                A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
+                upper[j], other[j] = other[j], upper[j]
             determinant = -determinant
-        determinant *= A[k, k]
-        if A[k, k] == 0.0:
-            A[k, k] = tiny
-        inverse = 1.0 / A[k, k]
-        A[k, k] = inverse
+        diagonal = upper[k]
+        determinant *= diagonal
+        if diagonal == 0.0:
+            diagonal = tiny
+        inverse = 1.0 / diagonal
+        upper[k] = inverse
         for i in range(k + 1, n):
-            factor = A[i, k] * inverse
-            A[i, k] = factor
+            row = A[i]
+            factor = row[k] * inverse
+            row[k] = factor
             for j in range(k + 1, n):
-                A[i, j] -= factor * A[k, j]
+                row[j] -= factor * upper[j]
     return determinant
 
 
 @kernel
-def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
+def lu_solve(LU: Array, pivots: Indices, b: Array) -> None:
     """Solve ``A x = b`` with the result of `lu_factor`; x replaces `b` (n,)."""
     n = LU.shape[0]
     for k in range(n):
-        b[k], b[pivots[k]] = b[pivots[k]], b[k]
+        pivot = pivots[k]
+        b[k], b[pivot] = b[pivot], b[k]
     for k in range(n):
+        row = LU[k]
         total = b[k]
         for j in range(k):
-            total -= LU[k, j] * b[j]
+            total -= row[j] * b[j]
         b[k] = total
     for k in range(n - 1, -1, -1):
+        row = LU[k]
         total = b[k]
         for j in range(k + 1, n):
-            total -= LU[k, j] * b[j]
-        b[k] = total * LU[k, k]
+            total -= row[j] * b[j]
+        b[k] = total * row[k]
 
 
 @kernel
@@ -164,8 +170,9 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
     derivatives = np.zeros((n + 1, n + 1))
     copy_vector(p, derivatives[n])
     for m in range(n - 1, 0, -1):
+        higher = derivatives[m + 1]
         for k in range(m + 1):
-            derivatives[m, k] = derivatives[m + 1, k + 1] * ((k + 1) / (n - m))
+            derivatives[m, k] = higher[k + 1] * ((k + 1) / (n - m))
     for m in range(1, n + 1):
         # Row m is monotonic between the roots of the previous one.
         q = derivatives[m, : m + 1]
@@ -257,9 +264,10 @@ def angles_of_zeros(p: Array, zoom: float, angles: Array, half_gaps: Array) -> i
     outside[1::2] *= -1.0
     for q, scale, offset in ((p, zoom, 0.0), (outside, 1.0 / zoom, math.pi)):
         for k in range(roots_in_unit_interval(q, scale, roots, gaps)):
+            root = roots[k]
             # A root at the border of both parts of the line belongs to the inner one.
-            if count < n and (offset == 0.0 or abs(roots[k]) < 1.0):
-                angles[count] = 2.0 * math.atan(scale * roots[k]) + offset
-                half_gaps[count] = 2.0 * gaps[k] / (1.0 / scale + scale * roots[k] * roots[k])
+            if count < n and (offset == 0.0 or abs(root) < 1.0):
+                angles[count] = 2.0 * math.atan(scale * root) + offset
+                half_gaps[count] = 2.0 * gaps[k] / (1.0 / scale + scale * root * root)
                 count += 1
     return count

@@ -8,9 +8,18 @@ Horn's closed form (*Recovering Baseline and Orientation from 'Essential' Matrix
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.geometry import Array, Indices
+from rs_relpose_ros.geometry.so3 import (
+    copy_matrix,
+    copy_vector,
+    cross,
+    exp_so3,
+    log_so3,
+    scale,
+    subtract,
+    write_column,
+)
 from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.common import Knowledge, Sample, Solutions
@@ -47,7 +56,7 @@ _QUADRATIC = ['xx', 'xy', 'xz', 'x1', 'yy', 'yz', 'y1', 'zz', 'z1', '11']
 _ORDER = 'xyz1'
 
 
-def _product_table(left: list[str], products: list[str]) -> NDArray[np.int64]:
+def _product_table(left: list[str], products: list[str]) -> Indices:
     """Index in `products` of each monomial of `left` times each of x, y, z, 1."""
     return np.array(
         [[products.index(''.join(sorted(m + v, key=_ORDER.index))) for v in _ORDER] for m in left]
@@ -94,7 +103,7 @@ def _null_space(rows: Array, basis: Array) -> None:
 
 
 @kernel
-def _add_product(p: Array, q: Array, factor: float, table: NDArray[np.int64], out: Array) -> None:
+def _add_product(p: Array, q: Array, factor: float, table: Indices, out: Array) -> None:
     """Add `factor` times the product of a polynomial and a linear one, `q` (4,), to `out`."""
     for i in range(len(table)):
         for j in range(4):
@@ -109,9 +118,7 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
     B_3 are the rows of `basis` (4, 9).
     """
     E = np.empty((9, 4))
-    for c in range(4):
-        for j in range(9):
-            E[j, c] = basis[c, j]
+    copy_matrix(basis.T, E)
     M[:] = 0.0
     minor = np.empty(10)
     for i in range(3):
@@ -124,17 +131,20 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
     EET = np.zeros((9, 10))
     for i in range(3):
         for j in range(i, 3):
+            product = EET[3 * i + j]
             for k in range(3):
-                _add_product(E[3 * i + k], E[3 * j + k], 1.0, _TO_QUADRATIC, EET[3 * i + j])
-            so3.copy_vector(EET[3 * i + j], EET[3 * j + i])
+                _add_product(E[3 * i + k], E[3 * j + k], 1.0, _TO_QUADRATIC, product)
+            copy_vector(product, EET[3 * j + i])
+    diagonal = EET[::4]
     for m in range(10):
-        half_trace = 0.5 * (EET[0, m] + EET[4, m] + EET[8, m])
-        for i in (0, 4, 8):
-            EET[i, m] -= half_trace
+        half_trace = 0.5 * (diagonal[0, m] + diagonal[1, m] + diagonal[2, m])
+        for i in range(3):
+            diagonal[i, m] -= half_trace
     for i in range(3):
         for j in range(3):
+            constraint = M[1 + 3 * i + j]
             for k in range(3):
-                _add_product(EET[3 * i + k], E[3 * k + j], 1.0, _TO_CUBIC, M[1 + 3 * i + j])
+                _add_product(EET[3 * i + k], E[3 * k + j], 1.0, _TO_CUBIC, constraint)
 
 
 @small_kernel
@@ -153,22 +163,24 @@ def _reduced_constraints(basis: Array, reduced: Array) -> bool:
         if attempt > 0:
             # A rotation by 60 degrees: the quaternion (1 + i + j + k) / 2 times (x, y, z, 1).
             for m in range(9):
-                a = basis[0, m]
-                b = basis[1, m]
-                c = basis[2, m]
-                d = basis[3, m]
-                basis[0, m] = 0.5 * (a - b - c - d)
-                basis[1, m] = 0.5 * (a + b - c + d)
-                basis[2, m] = 0.5 * (a + b + c - d)
-                basis[3, m] = 0.5 * (a - b + c + d)
+                column = basis[:, m]
+                a = column[0]
+                b = column[1]
+                c = column[2]
+                d = column[3]
+                column[0] = 0.5 * (a - b - c - d)
+                column[1] = 0.5 * (a + b - c + d)
+                column[2] = 0.5 * (a + b + c - d)
+                column[3] = 0.5 * (a - b + c + d)
         _cubic_constraints(basis, M)
-        so3.copy_matrix(M[:, :10], left)
+        copy_matrix(M[:, :10], left)
         algebra.lu_factor(left, pivots)
         coefficient = 0.0
         for j in range(10):
-            so3.copy_vector(M[:, 10 + j], reduced[j])
-            algebra.lu_solve(left, pivots, reduced[j])
-            for value in reduced[j, 4:]:
+            kept = reduced[j]
+            copy_vector(M[:, 10 + j], kept)
+            algebra.lu_solve(left, pivots, kept)
+            for value in kept[4:]:
                 coefficient = max(coefficient, abs(value))
         if coefficient < 1e4:
             break
@@ -190,11 +202,13 @@ def _degree_10(reduced: Array, B: Array, p: Array) -> None:
     for r in range(3):
         # Row 4 + 2 r less z times the next one: the leading monomials cancel.
         for c in range(3):
+            polynomial = B[r, c]
             terms = 4 if c == 2 else 3
             for j in range(terms):
                 power = terms - 1 - j
-                B[r, c, power] += reduced[3 * c + j, 4 + 2 * r]
-                B[r, c, power + 1] -= reduced[3 * c + j, 5 + 2 * r]
+                column = reduced[3 * c + j]
+                polynomial[power] += column[4 + 2 * r]
+                polynomial[power + 1] -= column[5 + 2 * r]
     p[:] = 0.0
     minor = np.empty(7)
     for r in range(3):
@@ -212,18 +226,18 @@ def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
 
     Returns False if E is not finite.
     """
-    V = np.zeros((3, 3))
+    V = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            for k in range(4, -1, -1):
-                V[i, j] = V[i, j] * z + B[i, j, k]
+            V[i, j] = algebra.value(B[i, j], z)
     (x, y, w), _ = algebra.null_direction(V)
     norm2 = 0.0
     for i in range(3):
         for j in range(3):
-            m = 3 * i + j
-            E[i, j] = x * basis[0, m] + y * basis[1, m] + w * (z * basis[2, m] + basis[3, m])
-            norm2 += E[i, j] * E[i, j]
+            b = basis[:, 3 * i + j]
+            entry = x * b[0] + y * b[1] + w * (z * b[2] + b[3])
+            E[i, j] = entry
+            norm2 += entry * entry
     if not 0.0 < norm2 < math.inf:
         return False
     E *= math.sqrt(2.0 / norm2)
@@ -238,26 +252,22 @@ def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
     translation.
     """
     t, length2 = algebra.null_direction(np.ascontiguousarray(E.T))
-    scale = 1.0 / math.sqrt(length2)
+    unit = scale(1.0 / math.sqrt(length2), t)
     for i in range(3):
-        x[i] = t[i] * scale
+        x[i] = unit[i]
     candidate = np.empty((3, 3))
     best = -1
     for twist in (1.0, -1.0):
-        for i in range(3):
-            i1 = (i + 1) % 3
-            i2 = (i + 2) % 3
-            for j in range(3):
-                j1 = (j + 1) % 3
-                j2 = (j + 2) % 3
-                cofactor = E[i1, j1] * E[i2, j2] - E[i1, j2] * E[i2, j1]
-                t_cross_E = x[i1] * E[i2, j] - x[i2] * E[i1, j]
-                candidate[i, j] = cofactor - twist * t_cross_E
+        for j in range(3):
+            # Column of the cofactors less a column of [t]x E.
+            cofactors = cross(E[:, (j + 1) % 3], E[:, (j + 2) % 3])
+            twisted = scale(twist, cross(unit, E[:, j]))
+            write_column(subtract(cofactors, twisted), candidate, 0, j)
         votes = max(common.cheirality_votes(sample, candidate, x))
         if votes > best:
             best = votes
             # The logarithm and the exponential remove the rounding.
-            so3.copy_matrix(so3.exp_so3(so3.log_so3(candidate)), R)
+            copy_matrix(exp_so3(log_so3(candidate)), R)
     return length2 > 1e-20
 
 
@@ -271,9 +281,12 @@ def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
     """
     rows = np.empty((5, 9))
     for k in range(5):
+        row = rows[k]
+        f1 = sample.f1[k]
+        f2 = sample.f2[k]
         for i in range(3):
             for j in range(3):
-                rows[k, 3 * i + j] = sample.f1[k, i] * sample.f2[k, j]  # f_1^T E f_2 = 0
+                row[3 * i + j] = f1[i] * f2[j]  # f_1^T E f_2 = 0
     basis = np.empty((4, 9))
     reduced = np.empty((10, 10))
     _null_space(rows, basis)

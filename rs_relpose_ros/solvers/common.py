@@ -16,6 +16,8 @@ from rs_relpose_ros.core.least_squares import cholesky, newton_step
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
+    add,
+    column,
     copy_matrix,
     copy_vector,
     cross,
@@ -25,6 +27,9 @@ from rs_relpose_ros.geometry.so3 import (
     norm,
     rotated,
     rotated_back,
+    scale,
+    subtract,
+    write_column,
 )
 from rs_relpose_ros.jit import inlined_kernel, kernel, KernelInterface, small_kernel
 from rs_relpose_ros.solvers.algebra import lu_factor, lu_solve, normalise
@@ -122,17 +127,10 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
     """
     front = 0
     behind = 0
-    for k in range(sample.f1.shape[0]):
-        f1 = sample.f1[k]
+    for k in range(len(sample.f1)):
         h = rotated(R, sample.f2[k])
-        tau1 = sample.tau1[k]
-        tau2 = sample.tau2[k]
-        b = (
-            x[0] + (tau2 * x[6] - tau1 * x[3]),
-            x[1] + (tau2 * x[7] - tau1 * x[4]),
-            x[2] + (tau2 * x[8] - tau1 * x[5]),
-        )
-        along1, along2, _ = scaled_depths(f1, h, b)
+        moved = subtract(scale(sample.tau2[k], x[6:]), scale(sample.tau1[k], x[3:]))
+        along1, along2, _ = scaled_depths(sample.f1[k], h, add(x, moved))
         if along1 > 0.0 and along2 > 0.0:
             front += 1
         elif along1 < 0.0 and along2 < 0.0:
@@ -157,25 +155,15 @@ def gravity_alignment(gravity: Array) -> Array:
     y = gravity[1] / length
     z = gravity[2] / length
     horizontal2 = x * x + y * y
-    A = np.zeros((3, 3))
     if z < 0.0 and horizontal2 < 1e-30:
         # Opposite to z: every half turn about a horizontal axis is a solution.
-        A[0, 0] = 1.0
-        A[1, 1] = -1.0
-        A[2, 2] = -1.0
-        return A
+        return np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     # 1 / (1 + z), without cancellation near z = -1.
     k = 1.0 / (1.0 + z) if z >= 0.0 else (1.0 - z) / horizontal2
-    A[0, 0] = 1.0 - k * x * x
-    A[0, 1] = -k * x * y
-    A[0, 2] = -x
-    A[1, 0] = -k * x * y
-    A[1, 1] = 1.0 - k * y * y
-    A[1, 2] = -y
-    A[2, 0] = x
-    A[2, 1] = y
-    A[2, 2] = z
-    return A
+    mixed = -k * x * y
+    row_x = [1.0 - k * x * x, mixed, -x]
+    row_y = [mixed, 1.0 - k * y * y, -y]
+    return np.array([row_x, row_y, [x, y, z]])
 
 
 @kernel
@@ -183,12 +171,10 @@ def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
     """Write ``A_1^T Rz(psi) A_2`` into `R` (3, 3)."""
     c = math.cos(psi)
     s = math.sin(psi)
-    A2 = known.align2
     for j in range(3):
-        aligned = (c * A2[0, j] - s * A2[1, j], s * A2[0, j] + c * A2[1, j], A2[2, j])
-        column = rotated_back(known.align1, aligned)
-        for i in range(3):
-            R[i, j] = column[i]
+        x, y, z = column(known.align2, 0, j)
+        turned = (c * x - s * y, s * x + c * y, z)
+        write_column(rotated_back(known.align1, turned), R, 0, j)
 
 
 @kernel
@@ -200,16 +186,18 @@ def yaw_cluster(sample: Sample, known: Knowledge) -> tuple[float, float]:
     centre is about ``argmax sum a . Rz(psi) b``, and the width is the rms distance of a and
     Rz(psi) b, limited to [1e-3, 1].
     """
-    count = sample.f1.shape[0]
+    count = len(sample.f1)
     along = 0.0
     across = 0.0
     total = 0.0
     for k in range(count):
         a = rotated(known.align1, sample.f1[k])
         b = rotated(known.align2, sample.f2[k])
-        along += a[0] * b[0] + a[1] * b[1]
-        across += a[1] * b[0] - a[0] * b[1]
-        total += dot(a, a) + dot(b, b) - 2.0 * a[2] * b[2]
+        a_x, a_y, a_z = a
+        b_x, b_y, b_z = b
+        along += a_x * b_x + a_y * b_y
+        across += a_y * b_x - a_x * b_y
+        total += dot(a, a) + dot(b, b) - 2.0 * a_z * b_z
     # The largest sum of the products of the horizontal parts is at the centre.
     total -= 2.0 * math.sqrt(along * along + across * across)
     width = math.sqrt(max(total, 0.0) / count)
@@ -246,7 +234,7 @@ def row_time_factors(sample: Sample) -> RowTimeFactors:
     """Scale the row times of a sample; p and q stay in [s] if velocities are not observable."""
     tau1 = sample.tau1
     tau2 = sample.tau2
-    n = tau1.shape[0]
+    n = len(tau1)
     m = 0.0
     for k in range(n):
         m += tau1[k] / n
@@ -276,20 +264,24 @@ def row_time_factors(sample: Sample) -> RowTimeFactors:
 @kernel
 def write_rows(sample: Sample, factors: RowTimeFactors, R: Array, A: Array, first: int) -> None:
     """Write A(R), rows n or ``[n, p n, q n]``, into the columns of `A` from `first` on."""
-    for k in range(sample.f1.shape[0]):
+    with_velocities = A.shape[1] - first > 3
+    for k in range(len(sample.f1)):
         n = cross(sample.f1[k], rotated(R, sample.f2[k]))
+        row = A[k, first:]
+        p = factors.p[k]
+        q = factors.q[k]
         for i in range(3):
-            A[k, first + i] = n[i]
-            if A.shape[1] - first > 3:
-                A[k, first + 3 + i] = factors.p[k] * n[i]
-                A[k, first + 6 + i] = factors.q[k] * n[i]
+            row[i] = n[i]
+            if with_velocities:
+                row[3 + i] = p * n[i]
+                row[6 + i] = q * n[i]
 
 
 @kernel
 def write_nearest_vector(sample: Sample, factors: RowTimeFactors, R: Array, y: Array) -> None:
     """Write the vector of the smallest singular value of A(R) into `y`, by inverse iteration."""
-    m = y.shape[0]
-    A = np.empty((sample.f1.shape[0], m))
+    m = len(y)
+    A = np.empty((len(sample.f1), m))
     factor = np.zeros((m, m))
     write_rows(sample, factors, R, A, 0)
     gram = A.T @ A
@@ -316,9 +308,9 @@ def linearise(
 
     Returns ``|A(R) y|^2`` and ``|A(R)|^2``.
     """
-    n = sample.f1.shape[0]
-    k = axes.shape[0]
-    m = y.shape[0]
+    n = len(sample.f1)
+    k = len(axes)
+    m = len(y)
     write_rows(sample, factors, R, system, k)
     squares = 0.0
     size2 = 0.0
@@ -326,21 +318,17 @@ def linearise(
         # With b = y_1 + p y_2 + q y_3 and h = R f_2, d((f_1 x h) . b) = theta . (h x (b x f_1)).
         b = (y[0], y[1], y[2])
         if m > 3:
-            p = factors.p[i]
-            q = factors.q[i]
-            b = (
-                b[0] + p * y[3] + q * y[6],
-                b[1] + p * y[4] + q * y[7],
-                b[2] + p * y[5] + q * y[8],
-            )
+            b = add(add(b, scale(factors.p[i], y[3:])), scale(factors.q[i], y[6:]))
         by_theta = cross(rotated(R, sample.f2[i]), cross(b, sample.f1[i]))
+        row = system[i]
         for j in range(k):
-            system[i, j] = dot(axes[j], by_theta)
-        right[i] = 0.0
+            row[j] = dot(axes[j], by_theta)
+        error = 0.0
         for j in range(m):
-            right[i] -= system[i, k + j] * y[j]
-            size2 += system[i, k + j] ** 2
-        squares += right[i] * right[i]
+            error -= row[k + j] * y[j]
+            size2 += row[k + j] ** 2
+        right[i] = error
+        squares += error * error
     for j in range(n + 1):
         system[n, j] = y[j - k] if j >= k else 0.0
     right[n] = 0.0
@@ -356,12 +344,12 @@ def polish(
     R moves about the `axes` (k, 3). The n equations have m + k = n + 1 unknowns, and ``|y| = 1``
     is the last equation. A step that does not reduce the error is shortened.
     """
-    n = sample.f1.shape[0]
-    k = axes.shape[0]
-    system = np.zeros((n + 1, n + 1))
-    right = np.empty(n + 1)
-    pivots = np.empty(n + 1, np.int64)
-    step = np.zeros(n + 1)
+    size = len(sample.f1) + 1
+    k = len(axes)
+    system = np.zeros((size, size))
+    right = np.empty(size)
+    pivots = np.empty(size, np.int64)
+    step = np.zeros(size)
     turn = np.empty(3)
     error = math.inf
     size2 = 0.0
@@ -403,7 +391,8 @@ def is_known(R: Array, rotations: Array) -> bool:
     for other in rotations:
         gap = 0.0
         for i in range(3):
-            gap += abs(other[i, 0] - R[i, 0]) + abs(other[i, 1] - R[i, 1])
+            for j in range(2):  # the third column follows from the first two
+                gap += abs(other[i, j] - R[i, j])
         if gap < 1e-9:
             return True
     return False
@@ -419,8 +408,9 @@ def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, 
         difference = 0.0  # ``d_2 - d_1``
         if len(y) > 3:
             difference = y[3 + i] / factors.s_p
-            x[6 + i] = y[6 + i] / factors.s_q
-            x[3 + i] = x[6 + i] - difference
+            d2 = y[6 + i] / factors.s_q
+            x[3 + i] = d2 - difference
+            x[6 + i] = d2
         x[i] = y[i] - factors.m * difference
     length2 = dot(x, x)
     # As |y| = 1, a translation of this size is rounding.

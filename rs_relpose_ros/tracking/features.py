@@ -14,13 +14,10 @@ from scipy.spatial import KDTree
 
 from rs_relpose_ros.config.settings import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Flags, Indices
 from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import checked, Image
-
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 # Side of the window [px] over which the structure tensor of the half-size image is summed. A
 # smaller one finds single pixels of noise, a larger one blurs corners that lie together.
@@ -132,10 +129,12 @@ def within(
     """Mask (N,) of points (N, 2) of an image that lie where `allowed` (H, W) is not zero."""
     if allowed is None:
         return np.ones(len(points), dtype=bool)
-    height, width = allowed.shape
-    u, v = np.rint(np.nan_to_num(points, nan=-1.0)).astype(np.int64).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    return np.asarray(inside & (allowed[v.clip(0, height - 1), u.clip(0, width - 1)] > 0))
+    last = np.array(allowed.shape[::-1]) - 1
+    pixels = np.rint(np.nan_to_num(points, nan=-1.0)).astype(np.int64)
+    nearest = pixels.clip(0, last)
+    inside = (pixels == nearest).all(axis=1)
+    u, v = nearest.T
+    return np.asarray(inside & (allowed[v, u] > 0))
 
 
 def keep_apart(
@@ -292,15 +291,17 @@ class DescriptorTracker:
         if not keypoints:
             return nothing
         points = np.array([k.pt for k in keypoints], dtype=np.float64)
+        rows = points[:, 1]
         first, last = feature_rows(self._config, image.shape[0])
+        kept = (rows >= first) & (rows <= last) & within(points, self._allowed)
         # One keypoint a place: SIFT repeats a place with several orientations.
         _, once = np.unique(points, axis=0, return_index=True)
-        kept = np.sort(once)
-        kept = kept[(points[kept, 1] >= first) & (points[kept, 1] <= last)]
-        kept = kept[within(points[kept], self._allowed)]
-        return _Keypoints(
-            self._ids.take(len(kept)), points[kept], np.ascontiguousarray(descriptors[kept])
-        )
+        is_first = np.zeros(len(points), dtype=bool)
+        is_first[once] = True
+        kept &= is_first
+        ids = self._ids.take(int(kept.sum()))
+        chosen: Descriptors = np.ascontiguousarray(descriptors[kept])  # type: ignore[assignment]
+        return _Keypoints(ids, points[kept], chosen)
 
     def _match(
         self,

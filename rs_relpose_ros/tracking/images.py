@@ -5,6 +5,7 @@ No field is trusted: sizes are checked before memory is allocated, and an unusab
 """
 
 from dataclasses import dataclass
+import struct
 from typing import Any, ClassVar, NamedTuple, Self
 
 import cv2
@@ -48,16 +49,15 @@ class GrayLevels:
     """
 
     def __init__(self) -> None:
-        self._low = self._high = 0.0
+        self._low = 0.0
+        self._high = 0.0
 
     def gray(self, pixels: NDArray[np.uint16]) -> Image:
         """Gray image (H, W) of the next image."""
         low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
-        if (
-            low < self._low
-            or high > self._high
-            or high - low < _LEAST_FILLED * (self._high - self._low) > _LEAST_RANGE
-        ):
+        fewest = _LEAST_FILLED * (self._high - self._low)
+        is_outside = low < self._low or high > self._high
+        if is_outside or high - low < fewest > _LEAST_RANGE:
             spare = _MARGIN * (high - low)
             self._low = max(low - spare, 0.0)
             self._high = max(high + spare, self._low + _LEAST_RANGE)
@@ -68,19 +68,21 @@ class GrayLevels:
 
 def is_dark(image: Image) -> bool:
     """Whether almost no pixel of a gray image (H, W) is bright: night, a covered lens."""
-    return bool(np.percentile(image[::_STRIDE, ::_STRIDE], _DARK_SHARE) < _DARK_GRAY)
+    bright = np.percentile(image[::_STRIDE, ::_STRIDE], _DARK_SHARE)
+    return bool(bright < _DARK_GRAY)
 
 
 # -- Size of a JPEG or PNG, from its header -------------------------------------------------------
 
-# First bytes of the files.
+# First bytes of a PNG. [derived: ISO/IEC 15948]
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
-# Start of an image, and of the next marker.
+# Start of a JPEG, and of its next marker. [derived: ISO/IEC 10918-1, as the markers below]
 _JPEG_SIGNATURE = b'\xff\xd8\xff'
+# Marker of the end of a JPEG. [derived: the same]
 _JPEG_END = b'\xff\xd9'
-# Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC.
+# Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC. [derived: the same]
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-# Markers without a length field: TEM and RST0 to RST7.
+# Markers without a length field: TEM and RST0 to RST7. [derived: the same]
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 # Bytes at the end of a file in which its end marker is searched: cameras pad their files, up to a
 # page of memory. [derived: pages have 4096 bytes]
@@ -96,7 +98,8 @@ def encoded_image_size(data: Bytes) -> tuple[int, int]:
     if start.startswith(_PNG_SIGNATURE):
         if len(start) < _PNG_HEADER or start[12:16] != b'IHDR' or b'IEND' not in end:
             raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')
-        return int.from_bytes(start[16:20], 'big'), int.from_bytes(start[20:24], 'big')
+        width, height = struct.unpack('>II', start[16:24])
+        return width, height
     if not start.startswith(_JPEG_SIGNATURE):
         raise InputError(f'compressed image of {len(data)} bytes is neither JPEG nor PNG')
     # The decoder would fill missing rows with gray and report no error.
@@ -219,7 +222,8 @@ def _roughness(pixels: NDArray[np.uint16]) -> float:
     """Mean difference of pixels two columns apart, which have one colour, in sigmas."""
     rows = pixels[::_STRIDE].astype(np.float32)
     sigma = float(np.std(rows))
-    return float(np.mean(np.abs(rows[:, 2:] - rows[:, :-2]))) / sigma if sigma > 0.0 else 0.0
+    steps = np.abs(rows[:, 2:] - rows[:, :-2])
+    return float(np.mean(steps)) / sigma if sigma > 0.0 else 0.0
 
 
 class Pixels(NamedTuple):
@@ -307,9 +311,9 @@ class RawImage:
 
     def _two_bytes(self) -> NDArray[np.uint16]:
         """Pixels of 16 bits, in the byte order of the message."""
-        order = '>u2' if self.is_bigendian else '<u2'
-        pixels = self._rows(2).view(order)
-        swapped = self._rows(2).view('<u2' if self.is_bigendian else '>u2')
+        rows = self._rows(2)
+        orders = ('>u2', '<u2') if self.is_bigendian else ('<u2', '>u2')
+        pixels, swapped = (rows.view(order) for order in orders)
         # Some drivers name the other order.
         if self.width > 2 and _roughness(swapped) < _OTHER_ORDER * _roughness(pixels):
             return swapped

@@ -6,16 +6,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.tracking import features, windows
 from rs_relpose_ros.tracking.images import checked, Image
-
-Flags = NDArray[np.bool_]
 
 # Factor from OpenCV's eigenvalues to the smallest eigenvalue of the structure tensor of the gray
 # levels. [derived: OpenCV divides by 2^20, and a Scharr gradient is 32 times the derivative]
@@ -33,8 +30,9 @@ _WORTH = 2.0
 # alignment has the accuracy of a match, tracking only has to stay on the point.
 # [chosen: a step of 0.02 px is a tenth of the noise of a match, one of 0.005 px a fortieth]
 _ENDS = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+# Criteria of tracking from frame to frame. [chosen: as above]
 _TRACKING_CRITERIA = (_ENDS, 15, 0.02)
-# [chosen: the same]
+# Criteria of the alignment. [chosen: as above]
 _ALIGNMENT_CRITERIA = (_ENDS, 20, 0.005)
 # Errors of a guess [px] that are corrected without a pyramid. A larger value lets windows find
 # neighbours of the same look, a smaller one costs a pyramid more often. [derived: half of _REACH]
@@ -80,7 +78,7 @@ class Flow(NamedTuple):
     """Points tracked into a second image."""
 
     points: Array  # (N, 2) in the second image
-    found: NDArray[np.bool_]  # (N,)
+    found: Flags  # (N,)
     strength: Array  # (N,) [gray^2/px^2] smallest eigenvalue of each window's structure tensor
 
 
@@ -272,10 +270,12 @@ def window_jacobians(points1: Array, points2: Array) -> Array:
     A column for each axis of the first image.
     """
     H = window_homography(points1, points2)
-    homogeneous = np.column_stack([points1, np.ones(len(points1))]) @ H.T
-    depth = homogeneous[:, 2, None, None]
-    mapped = homogeneous[:, :2] / depth[:, 0]
-    return (H[:2, :2] - mapped[:, :, None] * H[2, :2]) / depth
+    ones = np.ones(len(points1))
+    homogeneous = np.column_stack([points1, ones]) @ H.T
+    depth = homogeneous[:, 2:]
+    mapped = homogeneous[:, :2] / depth
+    by_depth = mapped[:, :, None] * H[2, :2]
+    return (H[:2, :2] - by_depth) / depth[:, :, None]
 
 
 class KltTracker:

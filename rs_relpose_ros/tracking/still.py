@@ -14,17 +14,14 @@ A cell that is still in most of the images of some seconds is static.
 """
 
 from collections import deque
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Flags
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.tracking.images import Image
-
-Flags = NDArray[np.bool_]
 
 # Columns and rows of the cells. [chosen: a cell of 40 px in 640x480 holds some texture, and a
 # static part of a tenth of the image covers several cells; 10..24 columns would do]
@@ -62,13 +59,6 @@ _LEAST_IMAGES = 20
 _STATIC = 0.8
 
 
-class Change(NamedTuple):
-    """Verdict on one image."""
-
-    repeated: bool  # whether the image is the one before, and no new image
-    static: Flags  # (ROWS, COLUMNS) cells that are static by now
-
-
 class StillParts:
     """Compares images with the rotation of the camera, in the order of time."""
 
@@ -80,35 +70,37 @@ class StillParts:
         self._before: NDArray[np.float32] | None = None  # the last new image, reduced
         self._counted: deque[tuple[int, Flags, Flags]] = deque()
 
-    def add(self, stamp_ns: int, image: Image, motion: Array) -> Change:
-        """Add the next image (H, W).
+    def add(self, stamp_ns: int, image: Image, motion: Array) -> bool:
+        """Add the next image (H, W); whether it repeats the last new image.
 
         `motion` (ROWS, COLUMNS, 2): displacement [px] of the centres of the cells by the rotation
         since the last new image; NaN where it is not known. The first image needs none.
         """
         height, width = image.shape
         scale = _WIDTH / width
-        size = (_WIDTH, max(round(height * scale), ROWS))
-        reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        reduced_height = max(round(height * scale), ROWS)
+        small = cv2.resize(image, (_WIDTH, reduced_height), interpolation=cv2.INTER_AREA)
+        reduced = small.astype(np.float32)
         before = self._before
         if before is None or before.shape != reduced.shape:
             self._before = reduced
-            return Change(False, self.static())
+            return False
         informative, still = _compared(before, reduced, motion * scale)
         enough = informative.mean() >= _INFORMATIVE
         repeated = bool(enough and still[informative].mean() >= _ALL)
         if not repeated:
             self._count(stamp_ns, informative, still)
             self._before = reduced
-        return Change(repeated, self.static())
+        return repeated
 
     def static(self) -> Flags:
         """Cells (ROWS, COLUMNS) that are static by the images of the last seconds."""
         if not self._counted:
             return np.zeros((ROWS, COLUMNS), dtype=bool)
-        informative = sum(one.astype(int) for _, one, _ in self._counted)
-        still = sum(one.astype(int) for _, _, one in self._counted)
-        return np.asarray((informative >= _LEAST_IMAGES) & (still >= _STATIC * informative))
+        _, informative, still = zip(*self._counted, strict=True)
+        counts = np.sum(informative, axis=0)
+        enough = counts >= _LEAST_IMAGES
+        return np.asarray(enough & (np.sum(still, axis=0) >= _STATIC * counts))
 
     def _count(self, stamp_ns: int, informative: Flags, still: Flags) -> None:
         self._counted.append((stamp_ns, informative, still & informative))

@@ -1,4 +1,4 @@
-"""Floatss around points: patches in one small image, their correlation and their exposure.
+"""Windows around points: patches in one small image, their correlation and their exposure.
 
 OpenCV's Lucas-Kanade prepares a whole image for a few hundred windows. On a mosaic of patches its
 cost does not depend on the size of the image.
@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, Indices
 from rs_relpose_ros.geometry.so3 import median
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import Image
 
 Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
 
 # Points further away than this [px] are moved to it: a wrong prediction may be anywhere, and a
 # larger number overflows as an integer. [chosen: any value in 1e5..1e8 is outside of all images]
@@ -85,24 +84,25 @@ def cut_warped(
 def _layout(
     points: Array,
     radius: int,
-) -> tuple[Integers, Integers, tuple[int, int]]:
+) -> tuple[Indices, Indices, tuple[int, int]]:
     """Centre pixels (N, 2) of patches, their upper left corners (N, 2) in one image, its shape."""
     bounded = np.clip(points, -_FARTHEST, _FARTHEST)
+    centres = np.rint(bounded).astype(np.int64)
     count = len(points)
     side = 2 * radius + 1
-    columns = max(math.isqrt(max(count - 1, 0)) + 1, 1)
+    columns = math.isqrt(max(count - 1, 0)) + 1
     rows = max(-(-count // columns), 1)
-    k = np.arange(count)
-    corners = side * np.column_stack([k % columns, k // columns])
-    return np.rint(bounded).astype(np.int64), corners, (side * rows, side * columns)
+    row, column = np.divmod(np.arange(count), columns)
+    corners = side * np.column_stack([column, row])
+    return centres, corners, (side * rows, side * columns)
 
 
 @kernel
 def _copy(
     image: Image,
-    first: Integers,
+    first: Indices,
     side: int,
-    corners: Integers,
+    corners: Indices,
     mosaic: Image,
 ) -> None:
     """Copy squares of pixels from `first` (N, 2) on to their `corners` (N, 2) in the mosaic."""
@@ -115,7 +115,7 @@ def _copy(
         top = first[k, 1]
         at = corners[k, 1] * columns + corners[k, 0]
         if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
-            # Indices that cannot be negative: rows are copied many bytes at a time.
+            # Numbers that cannot be negative: rows are copied many bytes at a time.
             source = np.uint64(top * width + left)
             to = np.uint64(at)
             for _ in range(side):
@@ -136,28 +136,25 @@ def _fill_maps(
     jacobians: Array,
     offsets: Array,
     radius: int,
-    corners: Integers,
+    corners: Indices,
     x: Floats,
     y: Floats,
 ) -> None:
     """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
     side = 2 * radius + 1
     for k in range(len(points)):
-        J = jacobians[k]
-        x_step = np.float32(J[0, 0])
-        y_step = np.float32(J[1, 0])
         across = offsets[k, 0] - radius
-        column = corners[k, 0]
-        for i in range(side):
-            down = offsets[k, 1] + i - radius
-            x0 = np.float32(points[k, 0] + J[0, 0] * across + J[0, 1] * down)
-            y0 = np.float32(points[k, 1] + J[1, 0] * across + J[1, 1] * down)
-            row = corners[k, 1] + i
-            xs = x[row, column : column + side]
-            ys = y[row, column : column + side]
-            for j in range(side):
-                xs[j] = x0 + x_step * np.float32(j)
-                ys[j] = y0 + y_step * np.float32(j)
+        for axis, target in ((0, x), (1, y)):
+            start = points[k, axis]
+            by_column = jacobians[k, axis, 0]
+            by_row = jacobians[k, axis, 1]
+            step = np.float32(by_column)
+            for i in range(side):
+                down = offsets[k, 1] + i - radius
+                first = np.float32(start + by_column * across + by_row * down)
+                values = target[corners[k, 1] + i, corners[k, 0] :]
+                for j in range(side):
+                    values[j] = first + step * np.float32(j)
 
 
 @kernel
@@ -323,7 +320,7 @@ def brightness_table(
 ) -> Image | None:
     """Gray level of the first image for each one of the second (256,); None if they agree.
 
-    Floatss of `side` pixels around matches (N, 2) are compared in the original images:
+    Windows of `side` pixels around matches (N, 2) are compared in the original images:
     interpolation smooths the noise and with it the contrast.
     """
     if not len(points1):
