@@ -28,9 +28,10 @@ from numba.extending import intrinsic
 
 # Versions of Numba whose private parts were tried. [measured: tests of the cache with each]
 TRIED = ('0.58', '0.59', '0.61', '0.68')
-# Folder of the package.
+# Folder of the package. [derived: place of this file]
 _PACKAGE = Path(__file__).parent
-# Imports from the package in a module's text: the module, and the names.
+# Imports from the package in the text of a module: the module, and the names. [derived: the layout
+# of ruff]
 _IMPORT = re.compile(rf'^from ({_PACKAGE.name}[\w.]*) import (\([^)]*\)|.*)', re.MULTILINE)
 
 
@@ -95,7 +96,7 @@ except AttributeError:
     _TEXT = b''.join(path.read_bytes() for path in sorted(_PACKAGE.rglob('*.py')))
     vars(numba.config)['CACHE_DIR'] = str(_folder() / hashlib.sha256(_TEXT).hexdigest())
 
-# Options of all kernels. The wrapper for callers in C would take a tenth of the compilation.
+# Options of all kernels. [measured: the wrapper for callers in C takes a tenth of the compilation]
 _OPTIONS: dict[str, Any] = {
     'cache': True,
     'nogil': True,

@@ -25,7 +25,8 @@ from rs_relpose_ros.geometry import Array
 # files have three digits at least; any value from 1e-3 to 1e-1 would do]
 _ORTHONORMAL = 1e-2
 
-# Model of the file -> `distortion_model` here, and its number of coefficients.
+# The models of files have these values of `distortion_model`. [derived: the documentation of the
+# tools]
 _MODELS = {
     'radtan': 'plumb_bob',
     'radial-tangential': 'plumb_bob',
@@ -38,7 +39,8 @@ _MODELS = {
     'none': 'plumb_bob',
     '': 'plumb_bob',
 }
-# Density of noise or random walk in the files of an IMU -> parameter.
+# Densities of noise and random walks in the files of an IMU are these parameters. [derived: the
+# same]
 _NOISE = {
     'gyroscope_noise_density': 'gyro_noise_density',
     'accelerometer_noise_density': 'accel_noise_density',
@@ -110,13 +112,14 @@ def _lens(model: object, pinhole: Sequence[Any], coefficients: Sequence[Any]) ->
 def _extrinsics(T_cam_imu: Array) -> dict[str, Any]:
     """Return the parameters of a transform (4, 4), ``p_cam = T p_imu``."""
     R = T_cam_imu[:3, :3]
-    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    position = T_cam_imu[:3, 3]
+    deviation = np.abs(R @ R.T - np.eye(3)).max()
     if deviation > _ORTHONORMAL or np.linalg.det(R) < 0.0:
         raise InputError('the rotation between camera and IMU is not orthonormal')
     quaternion = Rotation.from_matrix(R).as_quat()
     return {
-        'quat_cam_imu_xyzw': tuple(round(float(value), 9) for value in quaternion),
-        'imu_position': tuple(round(float(value), 9) for value in T_cam_imu[:3, 3]),
+        'quat_cam_imu_xyzw': tuple(quaternion.round(9).tolist()),
+        'imu_position': tuple(position.round(9).tolist()),
     }
 
 
@@ -244,7 +247,8 @@ def _ros(document: Mapping[str, Any]) -> Calibration:
     return Calibration('camera_calibration of ROS', values, size)
 
 
-# Tools: whether a document is theirs, and its reader.
+# Each tool has a test whether a document is its own, and a reader. [derived: the keys of the
+# table above]
 _TOOLS: tuple[
     tuple[
         Callable[[Mapping[str, Any]], bool],

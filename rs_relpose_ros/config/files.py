@@ -26,11 +26,12 @@ from rs_relpose_ros.output_files import written
 
 _logger = logging.getLogger(__name__)
 
-# Section of a parameter file that is read by default.
+# Section of a parameter file that is read by default. [derived: name of the node]
 _NODE = 'relpose_node'
-# Parameters of every ROS node, without effect offline.
+# Parameters that every ROS node has, without effect offline. [derived: rclpy of Jazzy]
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
 # Sigma of each parameter of a calibration. A file that has one of them is a calibration file.
+# [derived: the names of the parameters]
 _SIGMAS = {
     'readout_time': 'readout_time_sigma',
     'time_offset': 'time_offset_sigma',
@@ -38,7 +39,8 @@ _SIGMAS = {
     'quat_cam_imu_xyzw': 'axes_sigma',
     'camera_matrix': 'focal_length_sigma',
 }
-# Largest file that is read [bytes]; a file of all parameters has 10,000.
+# Largest file that is read [bytes]. A larger one is no parameter file, and would fill the memory.
+# [chosen: a file of all parameters has 10,000; any value in 1e5..1e8 would do]
 _MAX_BYTES = 1 << 20
 # Longest comment line of a generated file [characters]. [chosen: any value in 70..120 would do]
 _COMMENT_WIDTH = 95
@@ -213,7 +215,7 @@ def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: converted(name, value) for name, value in values.items()}
 
 
-# Head of the generated file.
+# Head of the generated file. [derived: how the file is made and read]
 _HEAD = """\
 # Parameters of relpose_node, global_shutter_node and `--params` of the commands, each at its
 # default.

@@ -25,7 +25,7 @@ from rs_relpose_ros.geometry.lens import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor, STAMP_EXPOSURES
 from rs_relpose_ros.solvers.api import SOLVERS
 
-# Legal values of kinds without limits, in words.
+# Words for the legal values of kinds without limits. [derived: the types]
 ANY_VALUE = {bool: 'true or false', str: 'text'}
 
 
@@ -107,7 +107,7 @@ class Settings:
             declared(item).check(item.name, value)
 
 
-# Legal values of the parameter solver.
+# Legal values of the parameter solver. [derived: the table of solvers]
 SOLVER_CHOICES = ('auto', *SOLVERS)
 
 
@@ -119,13 +119,14 @@ class CarrierMotion(NamedTuple):
     acceleration: float
 
 
-# Carriers by the value of the parameter motion.
+# Carriers by the value of the parameter motion. A range that is too narrow excludes the true
+# baseline, a wide one makes it less certain. [chosen: from slow to the usual top speed]
 MOTIONS = {
     'hand_held': CarrierMotion(0.1, 3.0, 1.5),
     'vehicle': CarrierMotion(0.5, 40.0, 1.5),
     'drone': CarrierMotion(0.2, 15.0, 3.0),
 }
-# Legal values of the parameter refinement.
+# Legal values of the parameter refinement. [derived: the paper has the last two]
 REFINEMENTS = ('map', 'alternating', 'none')
 
 
@@ -418,7 +419,7 @@ class OdometryConfig(Settings):
 
 
 # Tracker by name: a class that implements `rs_relpose_ros.tracking.features.Tracker`, imported on
-# first use. To add a tracker: write its module and a row here.
+# first use. To add a tracker, write its module and a row here. [derived: the modules]
 TRACKERS = {
     'klt': 'rs_relpose_ros.tracking.klt:KltTracker',
     'orb': 'rs_relpose_ros.tracking.features:DescriptorTracker',
@@ -523,7 +524,7 @@ class CalibrationConfig(Settings):
     )
 
 
-# Calibration from images, whose exposure is not zero.
+# Settings of a calibration from images, whose exposure is not zero. [derived: the field `exposed`]
 TRACKED_IN_IMAGES = CalibrationConfig(exposed=True)
 
 

@@ -249,6 +249,7 @@ DIRECTION = D1
 POSE = DW1
 # Deviations that move the estimate of the images alone. Their time offset is of the stamped row,
 # as the parameter; the deviations of the gyro are unknowns of whoever integrates it.
+# [derived: the deviations that enter by the rows and the lens]
 IMAGES = Selection.of(
     'axes', 'time_offset', 'readout_time', 'focal_log', 'principal_point', distortion=FIRST
 )

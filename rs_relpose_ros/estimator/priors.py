@@ -29,7 +29,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
 from rs_relpose_ros.jit import kernel, small_kernel
 
-# First local parameter of each unknown.
+# First local parameter of each unknown. [derived: the fields of `TwoViewState`]
 _UNKNOWNS = first_indices(theta=3, tangent=2, d1=3, d2=3, dw1=3, dw2=3, scale=1)
 # Rotation vector on the left of R. [derived: the order of the unknowns, as all of these]
 THETA = _UNKNOWNS['theta']

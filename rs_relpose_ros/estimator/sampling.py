@@ -302,6 +302,15 @@ class SolverMode:
         """Whether every solver requires gravity."""
         return all(solver.needs_gravity for solver in self.solvers)
 
+    def able(self, knows_rotation: bool, knows_gravity: bool) -> list[Solver]:
+        """The solvers that need no more than what is known."""
+        return [
+            solver
+            for solver in self.solvers
+            if (knows_rotation or not solver.needs_rotation)
+            and (knows_gravity or not solver.needs_gravity)
+        ]
+
     @property
     def fitted_points(self) -> int:
         """Matches that any hypothesis fits after its refinement, by its number of unknowns.
@@ -311,7 +320,8 @@ class SolverMode:
         return 14 if max(solver.sample_size for solver in self.solvers) >= 9 else 6
 
 
-# Modes by the value of the parameter solver.
+# Modes by the value of the parameter solver. The mode auto tries one solver after the other.
+# [derived: the table of solvers]
 MODES = {
     'auto': SolverMode(UNIFORM, (GYRO_2PT, SOLVERS['angular_3pt'], SOLVERS['angular_5pt'])),
     **{name: SolverMode(solver.model, (solver,)) for name, solver in SOLVERS.items()},
@@ -350,6 +360,8 @@ def draw_hypotheses(
     were skipped, since one before them had enough inliers.
     """
     known, has_gravity = _knowledge(problem)
+    # All addresses first, so that the first pair compiles the solvers of later pairs, too.
+    able = [(solver, solver.address) for solver in mode.able(known.predicted, has_gravity)]
     sampling = Sampling(
         problem.points,
         order,
@@ -358,13 +370,6 @@ def draw_hypotheses(
         config.max_iterations,
         seed,
     )
-    # All addresses first, so that the first pair compiles the solvers of later pairs, too.
-    able = [
-        (solver, solver.address)
-        for solver in mode.solvers
-        if (known.predicted or not solver.needs_rotation)
-        and (has_gravity or not solver.needs_gravity)
-    ]
     pool = Pool(
         np.zeros((POOL_SIZE, 3, 3)),
         np.zeros((POOL_SIZE, 9)),

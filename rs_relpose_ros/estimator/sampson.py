@@ -37,7 +37,7 @@ from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 # nearest cache with their rows. [chosen: any multiple of 8 in 32..128 would do]
 BLOCK = 64
 # First numbers of an observation: the vectors of both views, and the two row times. A block has
-# the root of the weight behind them.
+# the root of the weight behind them. [derived: three vectors in each view]
 _PARTS = first_indices(view_1=9, view_2=9, times=2)
 # First number of the view in image 1. [derived: the order of the parts]
 VIEW_1 = _PARTS['view_1']

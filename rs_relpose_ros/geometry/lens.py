@@ -136,7 +136,7 @@ def rational_profile(s: float, k: Array, out: Array) -> None:
         out[_GAIN + 1 + 2 * m] = 2.0 * (gain_slope - gain * below_slope) / below
 
 
-# In compiled code: profile_at(address, s, k, out).
+# Compiled code calls profile_at(address, s, k, out). [derived: `DistortionModel.profile`]
 _PROFILE_KERNEL = KernelInterface(numba.void, 0.0, np.empty(1), np.empty(1))
 profile_at = _PROFILE_KERNEL.call
 
@@ -191,7 +191,8 @@ class DistortionModel:
         return tuple(values)
 
 
-# The models by the name that CameraInfo has.
+# The models have the names that CameraInfo gives them. [derived: sensor_msgs/CameraInfo, and the
+# order of the coefficients in OpenCV]
 DISTORTION_MODELS = {
     model.name: model
     for model in (

@@ -21,16 +21,16 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.solvers import angular, common, uniform
 from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solver
 
-# Rays derotated by the gyro, and velocities.
+# This model has rays derotated by the gyro, and velocities. [derived: the paper, as all of these]
 UNIFORM = Model('uniform', derotated=True, velocities=True)
-# Rays as measured, and velocities.
+# This model has rays as measured, and velocities. [derived: the same]
 LINEAR = Model('linear', derotated=False, velocities=True)
-# Rays derotated by the gyro, and no velocities.
+# This model has rays derotated by the gyro, and no velocities. [derived: the same]
 ANGULAR = Model('angular', derotated=True, velocities=False)
-# Rays as measured, and no velocities.
+# This model has rays as measured, and no velocities. [derived: the same]
 GLOBAL = Model('global', derotated=False, velocities=False)
 
-# The public table of solvers by name.
+# The public table has the solvers by their names. [derived: the algorithms of the paper]
 SOLVERS = {
     solver.name: solver
     for solver in (
@@ -89,7 +89,8 @@ SOLVERS = {
     )
 }
 
-# This solver is not in the public table, because it does not estimate the rotation.
+# This solver is not in the public table, because it does not estimate the rotation. [derived: two
+# epipolar planes determine the direction of translation]
 GYRO_2PT = Solver(
     'gyro_2pt',
     2,
@@ -122,7 +123,7 @@ class MinimalSolution:
     v2: Array
 
 
-# End of the documentation of each solver.
+# The documentation of each solver ends with this text. [derived: the checks of `as_function`]
 _ARGUMENTS = """
 
     Parameters

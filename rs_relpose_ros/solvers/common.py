@@ -101,7 +101,7 @@ class Solver:
         return _INTERFACE.address(self.solve)
 
 
-# The one signature of all solvers.
+# The one signature that all solvers have. [derived: `Solver.solve`]
 _INTERFACE = KernelInterface(
     numba.int64,
     Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))),

@@ -63,7 +63,8 @@ class GrayLevels:
             self._high = max(high + spare, self._low + _LEAST_RANGE)
         scale = 255.0 / (self._high - self._low)
         levels = (pixels - np.float32(self._low)) * np.float32(scale)
-        return np.asarray(np.clip(levels, 0.0, 255.0).astype(np.uint8))
+        bounded = np.clip(levels, 0.0, 255.0)
+        return np.asarray(bounded.astype(np.uint8))
 
 
 def is_dark(image: Image) -> bool:
@@ -164,7 +165,8 @@ MAX_IMAGE_SIDE = 16384
 # [chosen: 64 Mpx of colour take 200 MB]
 MAX_IMAGE_PIXELS = 64 * 1024 * 1024
 
-# Encoding -> (channels, conversion of OpenCV). '8UC3' has no order; it is read as by cv_bridge.
+# Number of channels of each encoding, and the conversion of OpenCV. '8UC3' names no order; it is
+# read as cv_bridge reads it. [derived: sensor_msgs/image_encodings.hpp, as all encodings below]
 _COLOR = {
     'bgr8': (3, cv2.COLOR_BGR2GRAY),
     '8UC3': (3, cv2.COLOR_BGR2GRAY),
@@ -173,20 +175,23 @@ _COLOR = {
     'rgba8': (4, cv2.COLOR_RGBA2GRAY),
 }
 # OpenCV names a Bayer pattern by the second row from its second pixel on, ROS from the corner.
+# [derived: the documentation of both]
 _BAYER = {
     'bayer_rggb': cv2.COLOR_BayerBG2GRAY,
     'bayer_bggr': cv2.COLOR_BayerRG2GRAY,
     'bayer_gbrg': cv2.COLOR_BayerGR2GRAY,
     'bayer_grbg': cv2.COLOR_BayerGB2GRAY,
 }
-# Packed YUV 4:2:2 -> which of two successive bytes is the luma.
+# Packed YUV 4:2:2: this one of two successive bytes is the luma. [derived: the same]
 _PACKED_YUV = {'yuv422_yuy2': 0, 'yuyv': 0, 'yuv422': 1, 'uyvy': 1}
-# Planar YUV begins with the whole luma plane.
+# Planar YUV begins with the whole luma plane. [derived: the same]
 _PLANAR_YUV = ('nv21', 'nv12', 'nv24', 'i420', 'yuv420')
-# One byte per pixel, row by row, from the first byte on: the gray image itself.
+# These have one byte per pixel, row by row, from the first byte on: the gray image itself.
+# [derived: the same]
 _GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
 
-# Names of the pixels of a PNG or JPEG file, by their type and number of channels.
+# The pixels of a PNG or JPEG file have these names, by their type and number of channels.
+# [derived: the order of the channels in OpenCV]
 _ENCODED = {
     ('uint8', 1): 'mono8',
     ('uint8', 3): 'bgr8',
@@ -196,10 +201,10 @@ _ENCODED = {
     ('uint16', 4): 'bgra16',
 }
 
-# Two bytes per pixel, of which a camera may fill some bits only.
+# These have two bytes per pixel, of which a camera may fill some bits only. [derived: the same]
 _GRAY_16 = ('mono16', '16UC1')
 
-# All encodings that are known, in the words of sensor_msgs/Image.
+# All encodings that are known, in the words of sensor_msgs/Image. [derived: the tables above]
 ENCODINGS = (
     'mono8',
     '8UC1',
