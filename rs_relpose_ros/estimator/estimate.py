@@ -199,8 +199,8 @@ class Estimation:
 
     def _share(self, state: TwoViewState) -> float:
         """Share of the matches that are inliers of a state."""
-        use = sampson.select_inliers(self.matches, state, self.config.threshold)
-        return float(use.sum()) / len(self.order)
+        inliers = sampson.select_inliers(self.matches, state, self.config.threshold)
+        return float(inliers.sum()) / len(self.order)
 
     def _by_gyro(self) -> TwoViewState | None:
         """The state from the gyro's rotation, if it explains the matches."""
@@ -238,10 +238,9 @@ class Estimation:
         """Reason why the matches do not determine the sign of t; empty if they do."""
         if self.config.refinement != 'map':
             return ''
-        use = self.refined.inliers
-        count = np.count_nonzero(use)
-        within = np.abs(self.residuals[~use]) < self.config.threshold
-        others = np.count_nonzero(within)
+        inliers = self.refined.inliers
+        count = np.count_nonzero(inliers)
+        others = np.count_nonzero(np.abs(self.residuals[~inliers]) < self.config.threshold)
         if count - others >= SIGN_SIGMAS * math.sqrt(count + others):
             return ''
         return (
@@ -270,9 +269,9 @@ class Estimation:
     def _in_front(self, state: TwoViewState) -> TwoViewState:
         """The state or its mirror image, whichever has more matches in front of the cameras."""
         observations = self.matches.observations
-        errors = np.abs(sampson.residuals(observations, state))
-        use = (errors < self.config.threshold * sampling.SCALES[1]) & self.problem.valid
-        return priors.signed(state, sampson.cheirality_sign(observations, use, state))
+        residuals = np.abs(sampson.residuals(observations, state))
+        inliers = (residuals < self.config.threshold * sampling.SCALES[1]) & self.problem.valid
+        return priors.signed(state, sampson.cheirality_sign(observations, inliers, state))
 
     def _refined(self, state: TwoViewState) -> Refined:
         """The state on its inliers, by the refinement of the parameters."""
@@ -284,16 +283,16 @@ class Estimation:
             return velocity.fit_with_evidence(
                 matches, state, prior, config.threshold, scales, self._gyro_error()
             )
-        use = sampson.select_inliers(matches, state, config.threshold)
-        if config.refinement == 'alternating' and use.sum() >= LEAST_ALTERNATING:
-            used = matches._replace(weights=use.astype(float))
+        inliers = sampson.select_inliers(matches, state, config.threshold)
+        if config.refinement == 'alternating' and inliers.sum() >= LEAST_ALTERNATING:
+            used = matches._replace(weights=inliers.astype(float))
             state = self._in_front(fit.refine_alternating(used, state, model.velocities))
-            use = sampson.select_inliers(matches, state, config.threshold)
-        used = matches._replace(weights=use.astype(float))
+            inliers = sampson.select_inliers(matches, state, config.threshold)
+        used = matches._replace(weights=inliers.astype(float))
         log_scale = self.priors.velocity.log_scale
         return Refined(
             state,
-            use,
+            inliers,
             log_scale,
             math.exp(-log_scale),
             config.pixel_sigma,
@@ -335,11 +334,11 @@ class Estimation:
         """Reason why the inliers determine no pose; empty if they may."""
         config = self.config
         observations = self.matches.observations
-        use = self.refined.inliers
+        inliers = self.refined.inliers
         total = len(self.order)
         cell = config.threshold / self.matches.focal  # [rad]
         rays = (VIEW_1, VIEW_2)
-        count = min(sampling.distinct_directions(observations, use, ray, cell) for ray in rays)
+        count = min(sampling.distinct_directions(observations, inliers, ray, cell) for ray in rays)
         expected = total * min(CHANCE_SHARE * cell, MOST_BY_CHANCE)
         most = int(expected + CHANCE_SIGMAS * np.sqrt(expected))
         chance = most + self.mode.fitted_points
@@ -348,7 +347,7 @@ class Estimation:
                 f'{count} distinct of {total} matches agree, fewer than '
                 f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)'
             )
-        spread = min(sampling.distance_from_a_plane(observations, use, ray) for ray in rays)
+        spread = min(sampling.distance_from_a_plane(observations, inliers, ray) for ray in rays)
         if spread < DEGENERATE_THRESHOLDS * cell:
             return f'the {count} matches that agree lie on one line: the pose is not observable'
         return ''
@@ -376,15 +375,15 @@ class Estimation:
         """
         focal = self.matches.focal
         observations = self.matches.observations
-        use = self.refined.inliers
+        inliers = self.refined.inliers
         sigma = self.refined.sigma
         R = np.ascontiguousarray(self.refined.state.R)
-        parallax = so3.median(fit.transfer_errors(observations, use, R, focal))
+        parallax = so3.median(fit.transfer_errors(observations, inliers, R, focal))
         # Not from the rotation of the pose, which is arbitrary for points on a line.
-        of_rays = sampling.correlation(observations, use, VIEW_1, VIEW_2)
+        of_rays = sampling.correlation(observations, inliers, VIEW_1, VIEW_2)
         start = so3.aligning_rotation(of_rays)
-        R, information = fit.fit_rotation(observations, use, start, self.priors, focal, sigma)
-        residuals = fit.transfer_errors(observations, use, R, focal)
+        R, information = fit.fit_rotation(observations, inliers, start, self.priors, focal, sigma)
+        residuals = fit.transfer_errors(observations, inliers, R, focal)
         rms = float(np.sqrt(np.mean(residuals**2)))
         median = so3.median(residuals)
         least = self.config.min_parallax

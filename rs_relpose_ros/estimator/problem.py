@@ -73,14 +73,19 @@ def build_problem(
     still = FrameMotion(np.zeros(3))
     rotating = (motion1, motion2) if by_gyro else (still, still)
     observations = np.empty((len(points1), OBSERVATION))
-    for image, pixels in enumerate((points1, points2)):
+    for image, points in enumerate((points1, points2)):
         motion = rotating[image]
-        rays, jacobian = camera.unproject_with_jacobian(pixels)
-        tau = camera.pixel_times(pixels) - delay
-        turn_per_row = camera.line_delay * motion.angular_velocity
-        view = observations[:, VIEW_2 * image : VIEW_2 * (image + 1)]
-        derotate(rays, jacobian, motion.rotations(tau), turn_per_row, camera.readout_axis, view)
-        observations[:, TIMES + image] = tau
+        rays, jacobian = camera.unproject_with_jacobian(points)
+        row_times = camera.pixel_times(points) - delay
+        derotate(
+            rays,
+            jacobian,
+            motion.rotations(row_times),
+            camera.line_delay * motion.angular_velocity,
+            camera.readout_axis,
+            observations[:, VIEW_2 * image : VIEW_2 * (image + 1)],
+        )
+        observations[:, TIMES + image] = row_times
     valid = np.asarray(np.isfinite(observations).all(axis=1))
     observations[~valid] = 0.0
     return TwoViewProblem(
@@ -121,16 +126,19 @@ def derotate(
             view[i, 6 + j] = by_v[j]
 
 
+@kernel
 def _at_unit_depth(observations: Array) -> Array:
     """The points (6, N) of `sampling.multi_scale_cost`; NaN behind one of the cameras."""
     points = np.full((6, len(observations)), np.nan)
-    depth1 = observations[:, VIEW_1 + 2]
-    depth2 = observations[:, VIEW_2 + 2]
-    in_front = (depth1 > _NEAREST) & (depth2 > _NEAREST)
-    front = observations[in_front].T
-    points[0:2, in_front] = front[VIEW_1 : VIEW_1 + 2] / front[VIEW_1 + 2]
-    points[2:4, in_front] = front[VIEW_2 : VIEW_2 + 2] / front[VIEW_2 + 2]
-    points[4:6, in_front] = front[TIMES : TIMES + 2]
+    for i in range(len(observations)):
+        o = observations[i]
+        depth1 = o[VIEW_1 + 2]
+        depth2 = o[VIEW_2 + 2]
+        if depth1 > _NEAREST and depth2 > _NEAREST:
+            for k in range(2):
+                points[k, i] = o[VIEW_1 + k] / depth1
+                points[2 + k, i] = o[VIEW_2 + k] / depth2
+                points[4 + k, i] = o[TIMES + k]
     return points
 
 

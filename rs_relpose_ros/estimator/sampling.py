@@ -528,23 +528,23 @@ def gain_without_gyro(
     """
     focal = matches.focal
     observations = np.ascontiguousarray(matches.observations[matches.weights > 0.0])
-    use = np.ones(len(observations), dtype=bool)
+    inliers = np.ones(len(observations), dtype=bool)
     free = prior._replace(rotation_information=np.zeros((3, 3)))
     known = _unlikelihood(sampson.residuals(observations, state))
-    start = so3.aligning_rotation(correlation(observations, use, VIEW_1, VIEW_2))
-    spread = so3.median(transfer_errors(observations, use, start, focal))
-    R, _ = fit_rotation(observations, use, start, free, focal, 0.5 * spread)
+    start = so3.aligning_rotation(correlation(observations, inliers, VIEW_1, VIEW_2))
+    spread = so3.median(transfer_errors(observations, inliers, start, focal))
+    R, _ = fit_rotation(observations, inliers, start, free, focal, 0.5 * spread)
     t = translation_direction(observations, R)
     velocity = prior.velocity.rate * t
     state = priors.hypothesis_state(R, np.concatenate([t, velocity, velocity]))
-    state = priors.signed(state, sampson.cheirality_sign(observations, use, state))
+    state = priors.signed(state, sampson.cheirality_sign(observations, inliers, state))
     for k in range(_FREE_ROUNDS + 1):
-        r = sampson.residuals(observations, state)
-        gain = known - _unlikelihood(r)
+        residuals = sampson.residuals(observations, state)
+        gain = known - _unlikelihood(residuals)
         if k == _FREE_ROUNDS or (k == _PROMISING and gain < 0.0):
             break
-        sigma = robust_scale(r, _LEAST_SCALE, 0.0)
-        weights = cauchy_weight((r / (_FREE_SIGMAS * sigma)) ** 2)
+        sigma = robust_scale(residuals, _LEAST_SCALE, 0.0)
+        weights = cauchy_weight((residuals / (_FREE_SIGMAS * sigma)) ** 2)
         state = gauss_newton(FitMatches(observations, weights, sigma), state, free, _FREE_STEPS)
     return gain, state.R
 
@@ -553,8 +553,7 @@ def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
     turned = (R @ observations[:, VIEW_2 : VIEW_2 + 3].T).T
     normals = np.cross(observations[:, VIEW_1 : VIEW_1 + 3], turned).T
-    lengths = np.sqrt((normals**2).sum(axis=0))
-    normals /= np.maximum(lengths, 1e-3)
+    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
     _, axes = np.linalg.eigh(normals @ normals.T)
     return np.ascontiguousarray(axes[:, 0])
 
@@ -576,17 +575,17 @@ def correlation(observations: Array, use: Flags, first: int, second: int) -> Arr
     return out
 
 
-def distinct_directions(observations: Array, use: Flags, first: int, cell: float) -> int:
+def distinct_directions(observations: Array, inliers: Flags, first: int, cell: float) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
-    cells = np.round(observations[use, first : first + 2] / cell)
+    cells = np.round(observations[inliers, first : first + 2] / cell)
     return len(set((cells @ [1.0, 1e6]).tolist()))
 
 
-def distance_from_a_plane(observations: Array, use: Flags, first: int) -> float:
+def distance_from_a_plane(observations: Array, inliers: Flags, first: int) -> float:
     """Root mean square distance [rad] of the rays from the best plane through the centre.
 
     Small if the points lie in one place or, in the image, on one line.
     """
-    scatter = correlation(observations, use, first, first) / use.sum()
+    scatter = correlation(observations, inliers, first, first) / inliers.sum()
     least = np.linalg.eigvalsh(scatter)[0]
     return float(np.sqrt(max(least, 0.0)))
