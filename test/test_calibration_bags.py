@@ -1,5 +1,6 @@
 """``rs_relpose calibrate`` from bag to parameter file, and bags that it refuses."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 import tarfile
@@ -123,13 +124,40 @@ def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
     assert errors[0] < 0.5 * errors[1]
 
 
-@pytest.mark.parametrize(
-    ('change', 'reason'), [(lambda message: None, 'distortion coefficients'), (binned, 'binning')]
-)
-def test_lens_that_is_not_estimated(bag, change, reason, tmp_path, capsys):
-    path = copied(bag, tmp_path / 'bag', change)
+def test_lens_whose_coefficients_cancel_is_found(tmp_path):
+    """Of a RealSense, whose CameraInfo has no distortion; k1 alone would be about zero."""
+    true = (0.163, -0.520, 0.0, 0.0, 0.474)
+    config = replace(SMALL, distortion=true, duration=6.0)
+    write_bag(simulate(config), tmp_path / 'walk')
+    path, out = copied(tmp_path / 'walk', tmp_path / 'bag', nominal), tmp_path / 'out'
+    code, values = calibrated(path, out, '--lens')
+    assert code == 0
+    for found, expected in zip(values['distortion'], (0.163, -0.520, 0.474), strict=True):
+        assert abs(found['value'] - expected) < 3.0 * found['sigma']
+    assert values['distortion'][0]['value'] > 3.0 * values['distortion'][0]['sigma']
+    focal = values['focal_px']
+    assert abs(focal['value'] - SMALL.fx) < 3.0 * focal['sigma'] < 0.1 * SMALL.fx
+    intrinsics = read_parameters(out / 'calibration.yaml').intrinsics.of_image(320, 240)
+    assert intrinsics.distortion_model == 'plumb_bob'
+    assert len(intrinsics.distortion) == 5 and intrinsics.distortion[2:4] == (0.0, 0.0)
+    assert intrinsics.distortion[4] == pytest.approx(values['distortion'][2]['value'], abs=1e-5)
+
+
+def test_lens_is_estimated_about_the_distortion_of_a_camera_info(bag, tmp_path):
+    code, values = calibrated(bag, tmp_path / 'out', '--lens')
+    assert code == 0
+    camera = SMALL.camera
+    for found, expected in zip(values['distortion'], camera.radial_coefficients, strict=True):
+        assert abs(found['value'] - expected) < 3.0 * found['sigma']
+    # Tangential coefficients stay those of the CameraInfo.
+    written = read_parameters(tmp_path / 'out' / 'calibration.yaml').intrinsics
+    assert written.of_image(320, 240).distortion[2:4] == camera.distortion[2:4]
+
+
+def test_lens_of_a_binned_image_is_not_estimated(bag, tmp_path, capsys):
+    path = copied(bag, tmp_path / 'bag', binned)
     assert main(['calibrate', str(path), '--lens', '--out', str(tmp_path / 'out')]) == 2
-    assert reason in capsys.readouterr().err
+    assert 'binning' in capsys.readouterr().err
 
 
 def blank(message: Any) -> None:

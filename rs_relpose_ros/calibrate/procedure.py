@@ -602,8 +602,8 @@ class CalibrationInput:
     camera: RollingShutterCamera  # of the full sensor, its readout time 0
     focal_known: bool  # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]  # messages that were not used, by reason
-    lens_given: bool = False  # whether the distortion is that of a CameraInfo, yet estimated
     is_whole: bool = True  # whether the images show the whole sensor, without binning
+    lens_given: bool = False  # whether the distortion is that of a CameraInfo, yet estimated
 
     def calibrated(self, config: CalibrationConfig, **options: Any) -> CalibrationResult:
         """Its calibration; `options` of `calibrate`."""
@@ -800,5 +800,5 @@ class Recorder:
             camera,
             intrinsics is not None,
             unused,
-            self.size == (camera.width, camera.height),
+            is_whole=self.size == (camera.width, camera.height),
         )
