@@ -1,4 +1,4 @@
-# make demo | test | test-all | lint | clean | distclean
+# make demo | test | test-all | lint | docs | clean | distclean
 # Needs Python 3.11 or later with venv, make and git; everything else goes into $(VENV).
 
 PYTHON ?= python3
@@ -13,6 +13,7 @@ bin := $(VENV)/bin
 prefix := $(abspath $(VENV))
 stamp := $(VENV)/.installed
 test_stamp := $(VENV)/.installed-for-tests
+docs_stamp := $(VENV)/.installed-for-docs
 pip := $(bin)/python -m pip --quiet --quiet --disable-pip-version-check
 
 # What a run imports is byte-compiled by the set-up, or else the first run would do it, and every run
@@ -28,7 +29,7 @@ export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
 .DELETE_ON_ERROR:
-.PHONY: demo test test-all lint clean distclean same-python
+.PHONY: demo test test-all lint docs clean distclean same-python
 
 demo: $(stamp)
 	$(bin)/python demo/run_demo.py
@@ -50,6 +51,11 @@ lint: $(test_stamp)
 	$(bin)/ruff format --check --quiet . || { echo 'layout: run $(bin)/ruff format .' >&2; exit 1; }
 	$(bin)/ruff check .
 	$(bin)/mypy
+
+# Warnings are errors, and nothing is fetched. The pages are in build/docs/html.
+docs: $(docs_stamp)
+	$(bin)/python -m sphinx --fail-on-warning --keep-going --quiet -b html \
+	    -d build/docs/doctrees docs build/docs/html
 
 # The kernels, which need nothing of ROS, are compiled meanwhile. A failure there is reported by the
 # last step, which does what is left.
@@ -78,6 +84,10 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 $(test_stamp): $(stamp) requirements/test.txt
 	@echo 'Adding what tests and linters need: half a minute and 0.2 GB.'
 	$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
+	touch $@
+
+$(docs_stamp): $(stamp) requirements/docs.txt
+	$(pip) install --no-compile -r requirements/docs.txt $(CONSTRAINTS:%=-c %)
 	touch $@
 
 # A PYTHON that was asked for must be the one that an existing environment was made with.

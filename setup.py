@@ -129,6 +129,7 @@ setup(
         # Simulator, live measurements, experiments: simulate, benchmark and evaluate.
         'lab': [laboratory()],
         'test': ['pytest'],
+        'docs': ['sphinx>=7.2,<10', 'myst-parser>=3,<6', 'numpydoc>=1.6,<2'],
         'odometry': ['gtsam>=4.3,<4.4'],
         'video': ['av>=13,<19', 'telemetry-parser>=0.3,<0.4'],
         'ncore': ['nvidia-ncore>=19.8'],
