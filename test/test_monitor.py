@@ -16,6 +16,7 @@ from rs_relpose_ros.calibration import assessment, findings, posterior
 from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
+    Configured,
     Evidence,
     Finding,
     FindingState,
@@ -79,8 +80,12 @@ PARAMETERS = Parameters.from_mapping(
 )
 # Small deviations: rad, s, s, rad/s, -, -, -.
 SMALL = np.array([3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01, 0.01])
-CONFIGURED = assessment.Configured(
-    PARAMETERS.sensor, CAMERA, np.zeros(3), assessment.configured_sigmas(PARAMETERS, 0.0), NONE
+CONFIGURED = Configured(
+    PARAMETERS.sensor,
+    CAMERA,
+    np.zeros(3),
+    assessment.configured_sigmas(PARAMETERS, 0.0, CAMERA.width),
+    NONE,
 )
 
 
@@ -717,6 +722,7 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
             }
         ),
         from_reference=0.01,
+        width=640,
     )
     assert small[OFFSET] == pytest.approx(5e-4) and small[BIAS].tolist() == [0.003] * 3
     doubt = np.sqrt(
@@ -924,7 +930,7 @@ def test_tracked_values_are_those_of_the_parameters(direction, sign):
     """The offset is that of the middle row, with the active readout time: 2 ms more."""
     camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
     active = deviation(readout_time=sign * 0.002)
-    configured = assessment.Configured(
+    configured = Configured(
         sensor(readout_direction=direction), camera, np.full(3, 0.1), SIGMA, active
     )
     c = deviation(time_offset=0.004, readout_time=sign * 0.006)

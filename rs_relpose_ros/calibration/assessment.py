@@ -7,17 +7,18 @@ sigma of a correctly configured pose, *wrong* if it moves the pose out of its co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.findings import (
     Code,
+    Configured,
     Evidence,
     Finding,
     FindingState,
@@ -26,15 +27,11 @@ from rs_relpose_ros.calibration.findings import (
 )
 from rs_relpose_ros.calibration.posterior import Calibration
 from rs_relpose_ros.calibration.rotations import RotationComparison
-from rs_relpose_ros.config.settings import Parameters, SensorConfig
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import (
-    readout_direction,
-    REFERENCE_ROWS,
-    RollingShutterCamera,
-)
+from rs_relpose_ros.geometry.camera import readout_direction, REFERENCE_ROWS
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 
@@ -103,38 +100,20 @@ _LITTLE_OF = 0.25
 _TRACE = 0.34
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Configured:
-    """Parameters with which the pairs were estimated."""
-
-    sensor: SensorConfig
-    camera: RollingShutterCamera
-    gyro_bias: Array  # (3,) parameter [rad/s]
-    sigmas: Array  # (K,) configured, of the deviations; 0 if not known
-    active: Array  # (K,) deviations applied already: tracked parameters, bias at rest
-    center_sigma: float = 0.0  # [px] of the principal point, per axis
-
-    @property
-    def direction(self) -> float:
-        """1 if row 0 is configured to be read first, -1 if it is the last."""
-        return 1.0 if self.camera.reads_forward else -1.0
-
-
-def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
+def configured_sigmas(parameters: Parameters, from_reference: float, width: int) -> Array:
     """1 sigma (K,) of the deviations by the parameters, 0 where they are not known.
 
     `from_reference` [s]: interval between frames less that to which the time offset refers.
+    `width` [px]: of the image.
     """
-    sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(LIVE.size)
-    sigmas[LIVE.part('axes')] = sensor.axes_sigma
-    sigmas[LIVE.part('gyro_bias')] = parameters.imu.gyro_bias_sigma
-    sigmas[LIVE.index('time_offset')] = math.hypot(
-        sensor.time_offset_sigma, (from_reference * sensor.time_offset_per_interval_sigma)
-    )
-    sigmas[LIVE.index('readout_time')] = sensor.readout_time_sigma
-    sigmas[LIVE.index('focal_log')] = lens.focal_length_sigma
-    sigmas[LIVE.index('distortion')] = lens.distortion_sigma
-    return sigmas
+    sensor, sigmas = parameters.sensor, np.zeros(LIVE.size)
+    for name, sigma in parameters.deviation_sigmas().items():
+        if name in LIVE.parts:
+            sigmas[LIVE.part(name)] = sigma
+    by_interval = from_reference * sensor.time_offset_per_interval_sigma
+    offset = LIVE.index('time_offset')
+    sigmas[offset] = math.hypot(sigmas[offset], by_interval)
+    return np.asarray(sigmas / LIVE.scales(width))
 
 
 class Effect(NamedTuple):
@@ -308,8 +287,8 @@ class _Solution(NamedTuple):
 def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
     """Deviations, those `free` (K,) within their wide prior, others within configured sigmas."""
     sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
-    if free[LIVE.index('distortion')]:
-        factors = estimated.if_distorted
+    if free.any():
+        factors = estimated.if_free[:, free].max(axis=1)
         estimated = replace(
             estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
         )
@@ -466,36 +445,18 @@ def _values(
 
     `left`: deviation from the active values; of a vector, the most certain component is reported.
     """
-    camera, sensor = configured.camera, configured.sensor
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma = float(sigmas[worst])
     evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=len(calibration.b))
-    values: dict[Code, ArrayLike] = {  # active ones, in the unit of the quantity
-        Code.AXES: 0.0,
-        Code.TIME_OFFSET: sensor.time_offset + float(configured.active[LIVE.index('time_offset')]),
-        Code.READOUT_TIME: camera.readout_time,
-        Code.GYRO_BIAS: configured.gyro_bias + configured.active[LIVE.part('gyro_bias')],
-        Code.GYRO_SCALE: 1.0,
-        Code.FOCAL_LENGTH: camera.fx,
-        Code.DISTORTION: (*camera.distortion, 0.0)[0],
-    }
-    active = np.atleast_1d(np.asarray(values[quantity.code], dtype=np.float64))
-    estimated = active + left
-    if quantity.code is Code.AXES:
-        estimated = np.degrees([float(np.linalg.norm(left))])
-        sigma *= math.degrees(1.0)
-    elif quantity.code is Code.READOUT_TIME:  # the deviation is that of the signed one
-        estimated = active + configured.direction * left
-    elif quantity.code is Code.FOCAL_LENGTH:  # the deviation is that of its logarithm
-        estimated = active * np.exp(left)
-        sigma *= float(estimated[0])
+    active = np.atleast_1d(quantity.value(configured, np.zeros(len(left))))
+    estimated = np.atleast_1d(quantity.value(configured, left))
     return Finding(
         quantity.code,
         FindingState.OK,
         Why.CONSISTENT,
         tuple(active.tolist()),
         tuple(estimated.tolist()),
-        sigma,
+        sigma * quantity.per_deviation(configured, float(estimated[-1])),
         quantity.unit,
         component=worst if len(active) > 1 else 0,
         evidence=evidence,
