@@ -51,6 +51,7 @@ class Code(str, Enum):
     GYRO_SCALE = 'gyro_scale'
     FOCAL_LENGTH = 'focal_length'
     DISTORTION = 'distortion'
+    PRINCIPAL_POINT = 'principal_point'
     # Further causes that the consistency monitor names.
     READOUT_DIRECTION = 'readout_direction'
     GYRO_UNIT = 'gyro_unit'
@@ -306,6 +307,11 @@ def _first_coefficient(configured: Configured, left: Array) -> Array:
     return np.asarray((*configured.camera.distortion, 0.0)[0] + left)
 
 
+def _principal_point(configured: Configured, left: Array) -> Array:
+    camera = configured.camera
+    return np.asarray((camera.cx, camera.cy) + camera.width * left)
+
+
 def _time_offset(configured: Configured, left: Array) -> Array:
     applied = float(configured.active[LIVE.index('time_offset')])
     return np.asarray(configured.sensor.time_offset + applied + left)
@@ -402,6 +408,16 @@ QUANTITIES = (
         '',
         Shown('', 1.0, 3, 'first coefficient: ' + COMPARED, 'calibrate the lens'),
         _first_coefficient,
+    ),
+    Quantity(
+        Code.PRINCIPAL_POINT,
+        'principal_point',
+        0.01,
+        'px',
+        Shown('px', 1.0, 1, COMPARED, 'calibrate the camera at this crop and resolution'),
+        _principal_point,
+        lambda configured, estimated: configured.camera.width,
+        relative=2.0,
     ),
 )
 # The same by code.

@@ -152,6 +152,7 @@ LIVE = Selection.of(
     'readout_time',
     'gyro_bias',
     'focal_log',
+    'principal_point',
     gyro_scale=COMMON,
     distortion=FIRST,
 )
