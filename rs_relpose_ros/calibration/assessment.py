@@ -25,7 +25,7 @@ from rs_relpose_ros.calibration.findings import (
     Quantity,
     Why,
 )
-from rs_relpose_ros.calibration.posterior import Calibration
+from rs_relpose_ros.calibration.posterior import Calibration, OF_LENS
 from rs_relpose_ros.calibration.rotations import RotationComparison
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.core.deviations import LIVE
@@ -89,6 +89,9 @@ _LARGEST_GAIN = 100.0
 # Difference in chi-square below which another hypothesis fits as well. More would name two causes
 # where one is plain, less would name the wrong one of two. [derived: two sigmas]
 _AS_GOOD = 4.0
+# The same if one of the two can nearly cancel others, as the principal point does with the axes:
+# less would name one of them by chance. [derived: 5 in the log-likelihood]
+_CLEARLY = 10.0
 # Largest number of inconsistent quantities. Traces of a gross error need some, but with more of
 # seven the fit would be free. [chosen: 3 to 5 would do]
 _MOST_QUANTITIES = 4
@@ -158,7 +161,8 @@ def find_inconsistencies(
         )[:2]
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
-        if not found and solution.gain(quantity.part) - other.gain(second.part) < _AS_GOOD:
+        needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
+        if not found and solution.evidence(quantity) - other.evidence(second) < needed:
             alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
@@ -174,13 +178,13 @@ def _ranked(
     estimated: Calibration,
     configured: Configured,
 ) -> list[tuple[Quantity, _Solution]]:
-    """Hypotheses that free one more quantity each; the one that gains most in chi-square first."""
+    """Hypotheses that free one more quantity each; the one with most evidence first."""
     return sorted(
         (
             (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
             for quantity in quantities
         ),
-        key=lambda item: -item[1].gain(item[0].part),
+        key=lambda item: -item[1].evidence(item[0]),
     )
 
 
@@ -206,12 +210,14 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
     Those within configured sigmas exist for certain (the gyro bias is in the covariance of a pair
     already). Whether another quantity is off is not known: before the first pair the odds are
     even, and each quantity as likely. Consistent pairs lower the odds of a quantity as they lower
-    its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995)::
+    its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995).
+    Unknown quantities may be off together, but those that are `alone`::
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
     odds, known = 0.0, configured.sigmas > 0.0
     known[LIVE.part('gyro_bias')] = False
+    together, alone = ~known, np.zeros((LIVE.size, LIVE.size))
     estimated = replace(estimated, shared=1.0)
     for quantity in findings.QUANTITIES:
         part = quantity.part
@@ -222,13 +228,17 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
                 float(solution.off[part] @ inverse(covariance) @ solution.off[part]), _LARGEST_GAIN
             )
             of_prior = -2.0 * float(np.log(LIVE.sigmas[part]).sum())
-            odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(
-                findings.QUANTITIES
-            )
+            evidence = math.exp(0.5 * (log_determinant(covariance) + of_prior + gain))
+            own_odds = evidence / len(findings.QUANTITIES)
+            odds += own_odds
+            if quantity.alone:
+                alone += own_odds * solution.moment
+                together[part] = False
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[LIVE.part('gyro_bias')] = within[:, LIVE.part('gyro_bias')] = 0.0
-    return share * _solved(~known, estimated, configured).moment + (1.0 - share) * within
+    others = share * _solved(together, estimated, configured).moment
+    return np.asarray(others + alone / (1.0 + odds) + (1.0 - share) * within)
 
 
 def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
@@ -276,6 +286,15 @@ class _Solution(NamedTuple):
         """Gain in chi-square by some deviations."""
         # A vector gains more by chance.
         return float(self.off[part] @ self._along(part)) - 2.0 * (part.stop - part.start - 1)
+
+    def evidence(self, quantity: Quantity) -> float:
+        """Chi-square in favour of a quantity.
+
+        What a deviation of the lens explains in each pair for itself gains as well, and counts as
+        far as the pairs agree.
+        """
+        part = quantity.part
+        return self.certainty(part) ** 2 if quantity.entry in OF_LENS else self.gain(part)
 
     def certainty(self, part: slice) -> float:
         """Some deviations in sigmas, as the parts of the pairs scatter in their direction."""

@@ -274,6 +274,8 @@ class Quantity(NamedTuple):
     per_deviation: Callable[[Configured, float], float] = lambda configured, estimated: 1.0
     # Value that changes by all of itself with a deviation of 1, over the active one; 0: no value.
     relative: float = 0.0
+    # Whether it is off alone, if at all: with others free it could cancel their effect.
+    alone: bool = False
     tracking: str = ''  # name of the parameter that lets the node track the quantity
     reach: float = 0.0  # largest deviation that tracking applies
 
@@ -418,6 +420,7 @@ QUANTITIES = (
         _principal_point,
         lambda configured, estimated: configured.camera.width,
         relative=2.0,
+        alone=True,
     ),
 )
 # The same by code.

@@ -74,7 +74,7 @@ _READOUT = LIVE.index('readout_time')
 # Number of deviations before those of the lens, which come last.
 _LENS = LIVE.part('focal_log').start
 # Deviations that leave a pattern in the image: the entries of the lens.
-_OF_LENS = tuple(name for name in LIVE.parts if LENS.start <= PARTS[name].start < LENS.stop)
+OF_LENS = tuple(name for name in LIVE.parts if LENS.start <= PARTS[name].start < LENS.stop)
 # Of a state: rotation and direction of translation.
 _POSE = np.r_[THETA : THETA + 3, TANGENT : TANGENT + 2]
 
@@ -305,10 +305,8 @@ def residuals_by_deviation(state: TwoViewState, frames: list[FrameRows]) -> tupl
 
 def _gyro(pair: PairData) -> Array:
     """Rotation (3, D) of the gyro's rotation between the middle rows by all deviations."""
-    segment = pair.segment
-    times = (segment.stamps_ns - segment.stamps_ns[0]) * 1e-9
-    path = GyroPath.integrated(times, np.ascontiguousarray(segment.angular_velocities))
-    return row_states(path, pair.R_cam_imu, times[-1:], np.zeros(1)).by_deviation[0]
+    path = pair.segment.path
+    return row_states(path, pair.R_cam_imu, path.times[-1:], np.zeros(1)).by_deviation[0]
 
 
 def _normal_equations(linear: _Linearised, weights: Array, information: Array) -> _Normal:
@@ -411,7 +409,7 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
 
     by_regions = ratio(r)
     if_free = np.full(LIVE.size, by_regions)
-    for name in _OF_LENS:
+    for name in OF_LENS:
         part = LIVE.part(name)
         along = J[:, part]
         own = information[part, part] + np.diag(LIVE.sigmas[part] ** -2.0)

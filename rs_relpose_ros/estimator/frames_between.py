@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import MOTIONS
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.reprojection import (
     ACCELERATION,
     BIAS,
@@ -31,6 +32,7 @@ from rs_relpose_ros.core.reprojection import (
 from rs_relpose_ros.estimator import adjustment
 from rs_relpose_ros.estimator.adjustment import Adjusted, PathPriors, PathState
 from rs_relpose_ros.estimator.pair_problem import PairProblem
+from rs_relpose_ros.estimator.path_deviations import changes_by
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array
@@ -109,13 +111,22 @@ def refined(
             frames_reason='tracks and gyro of the frames between contradict each '
             f'other: {adjusted.sigma:.1f} px',
         )
-    return _result(
+    refined_pose = _result(
         pose,
         adjusted,
         path,
         tracks,
         priors,
     )
+    changes = changes_by(LIVE, path)
+    if changes is None:
+        return refined_pose
+    # The noise of the fit, with the error that residuals do not show.
+    noise = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
+    moved = adjustment.path_by_deviations(tracks, priors, state, noise, changes)
+    by_deviation = _pose_by_path(adjusted, tracks) @ moved
+    by_deviation[3:] += changes.rotations[-1]
+    return replace(refined_pose, by_deviation=by_deviation)
 
 
 def _with_inliers(
@@ -355,10 +366,7 @@ def _result(
     T = tracks.duration
     off = T * state.bias + state.rotations[-1]  # from the gyro's rotation
     R = exp_so3(off) @ tracks.rotations[-1]
-    by_state = np.zeros((6, len(C)))
-    by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
-    by_state[3:, BIAS : BIAS + 3] = T * np.eye(3)
-    by_state[3:, -3:] = np.eye(3)
+    by_state = _pose_by_path(adjusted, tracks)
     velocities, (by_first, by_second) = _velocities(state, path, len(C))
     # R^T p' rotates with the error of R.
     by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])
@@ -389,6 +397,15 @@ def _result(
         gyro_square=float(off @ np.linalg.solve(of_gyro, off)),
         pixel_sigma=adjusted.sigma,
     )
+
+
+def _pose_by_path(adjusted: Adjusted, tracks: TrackBlocks) -> Array:
+    """Derivative (6, n) of the pose by the unknowns of the path."""
+    by_path = np.zeros((6, len(adjusted.covariance)))
+    by_path[:3, TANGENT:LOG_SCALE] = tangent_basis(adjusted.state.t)
+    by_path[3:, BIAS : BIAS + 3] = tracks.duration * np.eye(3)
+    by_path[3:, -3:] = np.eye(3)
+    return by_path
 
 
 def _velocities(

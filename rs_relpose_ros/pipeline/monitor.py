@@ -87,6 +87,10 @@ class ConsistencyMonitor:
                 return pose
             self._due = information, pose, configured
             self.calibration = self._recursion.solved()
+            if pose.by_deviation is not None:
+                # The published pose is the one of all frames, which depends less on deviations.
+                information = replace(information, pose_by_deviation=pose.by_deviation)
+                self.latest, self._due = information, (information, pose, configured)
             by_deviation = information.pose_by_deviation
             shift = by_deviation @ self._deviation()
             if self._undetermined is None:
