@@ -27,15 +27,16 @@ def changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
     camera, points = problem.camera, problem.matches.points
     views, count = points.shape[:2]
     basis = selection.basis * selection.scales(camera.width)
-    inside = np.isfinite(points).all(axis=2) & (points[..., 1] >= 0.0)
-    inside &= points[..., 1] <= camera.height - 1.0
-    # The gyro covers the rows of the image only.
-    pixels = np.where(inside[..., None], points, (camera.cx, camera.reference_row_index))
-    rows = pixels[..., 1]
+    # The gyro covers the rows of the image only: other observations are put into its middle.
+    rows = camera.rows_of(points)
+    inside = np.isfinite(points).all(axis=2) & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
+    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
+    pixels = np.where(inside[..., None], points, middle)
+    rows = camera.rows_of(pixels)
     lens = camera.rays_by_lens(pixels.reshape(-1, 2)).by_lens @ basis[LENS]
     rays = camera.unproject(pixels.reshape(-1, 2)).reshape(views, count, 3)
     by_lens = lens.reshape(views, count, 3, selection.size)
-    shares = (rows - camera.reference_row_index) / camera.height
+    shares = (rows - camera.reference_row_index) / camera.row_count
     times = camera.row_times(rows)
     of_rays = np.empty((views, count, 3, selection.size))
     of_times = np.empty((views, count, selection.size))
