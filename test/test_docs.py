@@ -12,6 +12,7 @@ from types import ModuleType
 from urllib.parse import unquote
 
 from conftest import ROOT
+from fault_stream import BAG_TOPICS
 import logged_walks as made
 import pytest
 import yaml
@@ -256,3 +257,31 @@ def test_the_commands_of_a_tutorial_run(name, inputs, capsys):
         assert command_line.main(words[1:]) == 0, (line, capsys.readouterr())
     missing = [one for one in RESULTS[name] if not (inputs / one).exists()]
     assert missing == []
+
+
+# -- The first hour of the README ---------------------------------------------------------------
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / 'README.md').read_text(encoding='utf-8').splitlines()) <= 250
+
+
+def test_the_first_hour_clones_and_starts_what_exists(tmp_path):
+    """Its `git clone`, run; the topics of its node, those of the live tests."""
+    text = (ROOT / 'README.md').read_text(encoding='utf-8').replace('\\\n', ' ')
+    [clone] = re.findall(r'git clone \S+ \S+', text)
+    if not (ROOT / '.git').exists():
+        pytest.skip('no git checkout: nothing to clone')
+    words = clone.replace('~', str(tmp_path)).split()
+    subprocess.run(words, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    copy = Path(words[-1])
+    assert copy.name == 'rs_relpose_ros' and copy.parent.name == 'src'
+    assert (copy / 'package.xml').is_file()
+
+    started = re.search(r'ros2 run rs_relpose_ros relpose_node --ros-args(.*)', text)[1]
+    assert dict(re.findall(r'-r (\w+):=(\S+)', started)) == BAG_TOPICS
+    recorded = re.search(r'ros2 bag record (.*)', text)[1].split()
+    assert {topic.removesuffix('/compressed') for topic in recorded} >= set(BAG_TOPICS.values())
+    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    nodes = set(re.findall(r'ros2 run rs_relpose_ros (\w+)', text))
+    assert nodes and all(f"'{node} = " in setup for node in nodes)
