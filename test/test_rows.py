@@ -608,7 +608,7 @@ def test_a_lens_is_fitted_with_the_coefficients_of_the_format(lens, radial, most
     camera = made(trajectory, lens).camera
     fitted = formats.fitted(camera, radial)
     assert len(fitted.distortion) == 5
-    assert not any(formats.lens_of(fitted).k[radial:])
+    assert not any(formats.coefficients_of(fitted).k[radial:])
     u, v = np.meshgrid(np.arange(0.0, W, 20.0), np.arange(0.0, H, 20.0))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     errors = np.abs(fitted.project(camera.unproject(pixels)) - pixels)

@@ -82,9 +82,8 @@ _WATCH_NS = 50_000_000
 # Frame intervals without a frame after which the camera is silent. [chosen: 2 to 5: single frames
 # are dropped by any driver]
 _SILENT_FRAMES = 3
-# Time in which the innovations of pairs are averaged [ns]. [chosen: 0.5 to 2 s: some pairs]
-_RECENT_NS = 1_000_000_000
-# Most pairs that are remembered for it. [chosen: more than a second has]
+# Most pairs whose intervals are remembered: an interval may be longer than the one before. Fewer
+# would report missing pairs in slow motion. [chosen: 5 to 50, one to some seconds of pairs]
 _MOST_RECENT = 20
 # Times within this belong to one keyframe [ns]: a tracked readout time moves the middle row.
 # [chosen: 0.3 to 5 ms: between a correction and half a frame interval]
@@ -96,9 +95,9 @@ _GRAVITY_WINDOW = 1.0
 # loops share images. With less, states are beyond their covariances: with 1.8 are 19 % of the
 # positions of a phone. [measured: docs/lab/odometry.md, "Pairs in a row", "Noise by innovations"]
 _SHARED = 2.5
-# Innovation of a contradicting pair (chi squared per degree of freedom), by the mean of recent
-# ones. A larger gate uses pairs of moving objects, a smaller one rejects right ones: above 4 is
-# one in 800 by chance with 5 degrees of freedom, fewer with 11. [derived: chi squared]
+# Innovation of a contradicting pair (chi squared per degree of freedom). A larger gate uses pairs
+# of moving objects, a smaller one rejects right ones: above 4 is one in 800 by chance with 5
+# degrees of freedom, fewer with 11. [derived: chi squared]
 _CONTRADICTING = 4.0
 # Chi squared of a window per degree of freedom of a wrong start. It must be above that of a right
 # one, which is 1 to 2 where noises are configured too small. [chosen: 2.5 to 4 would do]
@@ -146,10 +145,8 @@ class _Run:
     frame_id: str
     # Variances of position and heading at the newest pair that was used.
     variances: tuple[float, float] = (0.0, 0.0)
-    # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
-    recent: deque[tuple[int, float, float]] = field(
-        default_factory=lambda: deque(maxlen=_MOST_RECENT)
-    )
+    # Intervals of recent pairs [s].
+    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_RECENT))
     pairs: int = 0  # used
     largest: float = 0.0  # innovation before the start
     contradicting: int = 0  # not used
@@ -503,21 +500,14 @@ class OdometryEstimator:
     ) -> None:
         """Add a keyframe at the pair's current image, and the pair if it agrees with the path."""
         at_ns = pair.current_imu_ns
-        # Pairs that deviate together are wrong together: their covariance is too small by that.
-        # [measured: docs/lab/odometry.md, "Deviations": walks do not need this factor; it is kept
-        # for recordings, on which it was not left out]
-        recent = [one for when, one, _ in run.recent if when > at_ns - _RECENT_NS]
-        inflation = max(1.0, float(np.mean(recent or [1.0])))
         # The gyro predicts a rotation before the scale is known.
         gated = run.published or run.continued or pair.is_pure_rotation
-        gate = inflation * _CONTRADICTING if gated else math.inf
+        gate = _CONTRADICTING if gated else math.inf
         at_rest = pair.is_pure_rotation and interval.at_rest
-        innovation = run.graph.add(
-            interval, pair, at_rest, inflation=_SHARED * inflation, gate=gate
-        )
+        innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED, gate=gate)
         self._find(run, interval, at_ns)
         run.stamps.append((pair.stamp_ns, at_ns))
-        run.recent.append((at_ns, min(innovation, _CONTRADICTING), interval.duration))
+        run.intervals.append(interval.duration)
         if innovation > gate:
             self._corrections += 1
             self._reject(run, pair)
@@ -610,7 +600,7 @@ class OdometryEstimator:
         if 0 < self._frame_interval_ns < NANOSECONDS:  # of a topic with each frame
             silent = silent_ns > _SILENT_FRAMES * self._frame_interval_ns
             return _OVERDUE if silent else self._longest_interval + _PAIR_DELAY
-        usual = max((seconds for *_, seconds in run.recent), default=0.0)
+        usual = max(run.intervals, default=0.0)
         return max(_OVERDUE, _OVERDUE_INTERVALS * usual)
 
     # -- start and end -----------------------------------------------------------------------

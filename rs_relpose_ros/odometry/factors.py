@@ -214,16 +214,20 @@ class _PairResiduals:
         """Remember residual and derivatives at two bodies and the vector of `doubts`."""
         unknown, n = self._unknown, self._size
         axes, delay = unknown.mount(d)
-        mount = Mount(unknown.R_cam_body_configured, d[doubts.ARM].copy(), axes, delay)
+        arm = d[doubts.ARM].copy()
+        mount = Mount(unknown.R_cam_body_configured, arm, axes, delay)
         all_errors, all_by = deviations(first, second, mount, self._measured)
-        errors = all_errors[:n] - self._by_images @ d[unknown.images]
         by = all_by[:n]
+        of_images = self._by_images @ d[unknown.images]
+        errors = all_errors[:n] - of_images
         whole = (by.T @ self._root.T).T  # column-major, as gtsam requires
-        by_others = by[:, COLUMNS['mount']] @ unknown.by_mount - self._by_images
+        of_mount = by[:, COLUMNS['mount']]
+        by_others = of_mount @ unknown.by_mount - self._by_images
         by_doubts = np.zeros((self.rows, unknown.size), order='F')
         by_doubts[:, doubts.ARM] = whole[:, COLUMNS['arm']]
         by_doubts[:, unknown.images] = self._root @ by_others
-        self._derivatives = [*(whole[:, columns] for columns in _OF_BODIES), by_doubts]
+        self._derivatives = [whole[:, columns] for columns in _OF_BODIES]
+        self._derivatives.append(by_doubts)
         self._residual = self._root @ errors + self._offset
 
 
@@ -234,28 +238,32 @@ def still_factor(
     unknown: Doubts,
 ) -> Any:
     """The camera keeps its position under any rotation of the body; 1 sigma per axis [m]."""
+    first, second, common = X(i), X(j), L(0)
 
     def error(
-        factor: Any,
+        _: Any,
         values: Any,
         jacobians: Any,
     ) -> Array:
-        first, second, common = factor.keys()
         pose1, pose2 = values.atPose3(first), values.atPose3(second)
-        R1, R2 = pose1.rotation().matrix(), pose2.rotation().matrix()
+        R1 = pose1.rotation().matrix()
+        R2 = pose2.rotation().matrix()
         arm = values.atVector(common)[doubts.ARM]
         if jacobians is not None:
             across = skew(arm)
-            jacobians[0] = np.asfortranarray(np.hstack([R1 @ across, -R1]))
-            jacobians[1] = np.asfortranarray(np.hstack([-R2 @ across, R2]))
+            by_pose1 = np.hstack([R1 @ across, -R1])
+            by_pose2 = np.hstack([-R2 @ across, R2])
             by_doubts = np.zeros((3, unknown.size), order='F')
             by_doubts[:, doubts.ARM] = R2 - R1
+            jacobians[0] = np.asfortranarray(by_pose1)
+            jacobians[1] = np.asfortranarray(by_pose2)
             jacobians[2] = by_doubts
         before = pose1.translation() + R1 @ arm
         after = pose2.translation() + R2 @ arm
         return np.asarray(after - before)
 
-    return gtsam.CustomFactor(diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
+    noise = diagonal([sigma] * 3)
+    return gtsam.CustomFactor(noise, [first, second, common], error)
 
 
 def loop_bound(dimension: int) -> float:

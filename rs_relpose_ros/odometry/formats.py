@@ -224,8 +224,8 @@ def projected(
 # -- lenses ---------------------------------------------------------------------------------------
 
 
-class Lens(NamedTuple):
-    """Coefficients by OpenCV's names; `fisheye`: k1 to k4 are those of the angle."""
+class Coefficients(NamedTuple):
+    """Distortion by OpenCV's names; `fisheye`: k1 to k4 are those of the angle."""
 
     fisheye: bool
     k: tuple[float, ...]  # k1 to k6, or k1 to k4
@@ -233,31 +233,40 @@ class Lens(NamedTuple):
     s: tuple[float, ...]  # s1 to s4
 
 
-def lens_of(camera: RollingShutterCamera) -> Lens:
+def coefficients_of(camera: RollingShutterCamera) -> Coefficients:
     """Coefficients of a camera; without distortion all are zero."""
+    none = (0.0,) * 4
     if camera.distortion_model == 'equidistant':
-        return Lens(True, tuple(camera.distortion or (0.0,) * 4), (0.0, 0.0), (0.0,) * 4)
-    k1, k2, p1, p2, k3, k4, k5, k6, *s = (*camera.distortion, *[0.0] * 12)[:12]
-    return Lens(False, (k1, k2, k3, k4, k5, k6), (p1, p2), tuple(s))
+        k = tuple(camera.distortion or none)
+        return Coefficients(True, k, (0.0, 0.0), none)
+    padded = (*camera.distortion, *[0.0] * 12)
+    k1, k2, p1, p2, k3, k4, k5, k6, *s = padded[:12]
+    k = (k1, k2, k3, k4, k5, k6)
+    return Coefficients(False, k, (p1, p2), tuple(s))
 
 
 def fitted(camera: RollingShutterCamera, radial: int) -> RollingShutterCamera:
     """The camera with k1 to k`radial`, p1 and p2 only, by least squares over the image."""
-    lens = lens_of(camera)
-    if lens.fisheye or not (any(lens.k[radial:]) or any(lens.s)):
+    lens = coefficients_of(camera)
+    is_simple = not any(lens.k[radial:]) and not any(lens.s)
+    if lens.fisheye or is_simple:
         return camera
     columns = np.linspace(0.0, camera.width - 1.0, _FIT_GRID)
     rows = np.linspace(0.0, camera.height - 1.0, _FIT_GRID)
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    grid = np.meshgrid(columns, rows)
+    pixels = np.stack(grid, axis=-1).reshape(-1, 2)
     rays = camera.unproject(pixels)
     known = np.isfinite(rays).all(axis=1)
-    plane = rays[known, :2] / rays[known, 2:]
-    distorted = (pixels[known] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    rays = rays[known]
+    plane = rays[:, :2] / rays[:, 2:]
+    center = camera.cx, camera.cy
+    focal = camera.fx, camera.fy
+    distorted = (pixels[known] - center) / focal
     design = _distortion_columns(plane, radial)
     right = (distorted - plane).T.ravel()
-    found = np.linalg.lstsq(design, right, rcond=None)[0].tolist()
-    k1, k2, *k3 = found[:radial]
-    p1, p2 = found[radial:]
+    found, *_ = np.linalg.lstsq(design, right, rcond=None)
+    k1, k2, *k3 = found[:radial].tolist()
+    p1, p2 = found[radial:].tolist()
     distortion = (k1, k2, p1, p2, *(k3 or [0.0]))
     return replace(camera, distortion_model='plumb_bob', distortion=distortion)
 
@@ -269,10 +278,14 @@ def _distortion_columns(plane: Array, radial: int) -> Array:
     """
     x, y = plane.T
     r2 = x * x + y * y
-    columns = [np.concatenate([x * r2**i, y * r2**i]) for i in range(1, radial + 1)]
-    columns.append(np.concatenate([2.0 * x * y, r2 + 2.0 * y * y]))
-    columns.append(np.concatenate([r2 + 2.0 * x * x, 2.0 * x * y]))
-    return np.column_stack(columns)
+    cross = 2.0 * x * y
+    columns = []
+    for order in range(1, radial + 1):
+        power = r2**order
+        columns.append(np.concatenate([x * power, y * power]))
+    by_p1 = np.concatenate([cross, r2 + 2.0 * y * y])
+    by_p2 = np.concatenate([r2 + 2.0 * x * x, cross])
+    return np.column_stack([*columns, by_p1, by_p2])
 
 
 # -- exporters ------------------------------------------------------------------------------------
@@ -327,7 +340,7 @@ def _write_colmap(model: Model, folder: Path) -> None:
 
 def _colmap_camera(camera: RollingShutterCamera) -> tuple[str, str]:
     """Lines of COLMAP's cameras.txt, by the simplest model that holds the lens."""
-    lens = lens_of(camera)
+    lens = coefficients_of(camera)
     first, rest = lens.k[:2], lens.k[2:]
     if lens.fisheye:
         name, distortion = 'OPENCV_FISHEYE', lens.k
@@ -359,7 +372,7 @@ def _write_transforms(
 
     `of_frames`: arrays (F, ...) by the key that they have in each frame.
     """
-    camera, lens = model.camera, lens_of(model.camera)
+    camera, lens = model.camera, coefficients_of(model.camera)
     value: dict[str, Any] = {'w': camera.width, 'h': camera.height}
     value |= zip(('fl_x', 'fl_y', 'cx', 'cy'), _focal_and_centre(camera), strict=True)
     terms = dict(zip(('k1', 'k2', 'k3', 'k4', 'p1', 'p2'), lens.k[:4] + lens.p, strict=True))
@@ -388,7 +401,9 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
         model,
         folder,
         {
-            'camera_model': 'OPENCV_FISHEYE' if lens_of(model.camera).fisheye else 'OPENCV',
+            'camera_model': 'OPENCV_FISHEYE'
+            if coefficients_of(model.camera).fisheye
+            else 'OPENCV',
             'orientation_override': 'none',
             'auto_scale_poses_override': False,
             'ply_file_path': 'sparse_pc.ply',
@@ -435,7 +450,7 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
         model,
         folder,
         {
-            'is_fisheye': lens_of(camera).fisheye,
+            'is_fisheye': coefficients_of(camera).fisheye,
             'rolling_shutter': (model.rolls * shutter).tolist(),
             'aabb_scale': 32,
             'scale': scale,
@@ -461,7 +476,7 @@ def _write_gsplat(model: Model, folder: Path) -> None:
     at the row that is read first (`viewmats`) and last (`viewmats_rs`), slerp and lerp between at
     ``floor(y) / (H - 1)``, or ``floor(x) / (W - 1)``; `rolling_shutter`: `_GSPLAT_SHUTTERS`.
     """
-    camera, lens = model.camera, lens_of(model.camera)
+    camera, lens = model.camera, coefficients_of(model.camera)
     views = np.linalg.inv(model.poses)
     K = camera.camera_matrix
     K[:2, 2] += _HALF_PIXEL
@@ -553,7 +568,7 @@ _NCORE_SHUTTERS = {
 
 def _ncore_camera(model: Model, types: Any) -> Any:
     """Camera parameters of NCore; `types`: its module ``ncore.impl.data.types``."""
-    camera, lens = model.camera, lens_of(model.camera)
+    camera, lens = model.camera, coefficients_of(model.camera)
     direction = camera.readout_direction if model.rolls else 'global'
     shutter = types.ShutterType[_NCORE_SHUTTERS[direction]]
     fx, fy, cx, cy = _focal_and_centre(camera)

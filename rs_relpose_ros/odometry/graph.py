@@ -64,10 +64,15 @@ _SMOOTHING_ITERATIONS = 10
 # [measured: others change no path by 0.1 mm, docs/lab/odometry.md, "As a process"]
 _ERROR_TOLERANCE = 1e-4
 
+# Covariance of three values of unit variance.
+_EYE = np.eye(3)
+
 # Columns of the derivatives of an IMU factor by the unknowns of its first keyframe.
 _OF_FIRST = np.r_[factors.IMU['X1'], factors.IMU['V1'], factors.IMU['B1']]
 # The same of its second keyframe.
 _OF_SECOND = np.r_[factors.IMU['X2'], factors.IMU['V2'], factors.IMU['B2']]
+# The same of `doubts`.
+_OF_DOUBTS = slice(factors.IMU['B2'].stop, None)
 # Columns of the covariance of a keyframe; the vector of `doubts` follows.
 _KEYFRAME = slices({'pose': 6, 'velocity': 3, 'accel_bias': 3, 'gyro_bias': 3, 'arm': 3})
 POSE = _KEYFRAME['pose']
@@ -80,7 +85,7 @@ ARM = _KEYFRAME['arm']
 BIAS = slice(_KEYFRAME['accel_bias'].start, GYRO_BIAS.stop)
 DOUBTS = slice(ARM.start, None)
 # Unknowns of a keyframe without `doubts`.
-_OWN = ARM.start
+_OWN = slice(0, ARM.start)
 
 
 class GraphError(RsRelposeError):
@@ -266,12 +271,14 @@ class KeyframeGraph:
         Images without translation alone do not show it: an object that moves with the camera may
         fill the view.
         """
+        i, j = self._count - 1, self._count
         sigma = self._config.pure_rotation_motion
-        still = factors.still_factor(self._count - 1, self._count, sigma, self._doubts)
+        still = factors.still_factor(i, j, sigma, self._doubts)
         motion = self._innovation(step, still)
-        known = math.sqrt(np.linalg.norm(motion.covariance, 2)) * sigma
-        agrees = known < _STILL_SIGMA and motion.chi_squared <= _STILL_GATE
-        if at_rest or agrees:
+        largest_variance = np.linalg.norm(motion.covariance, 2)
+        known = sigma * math.sqrt(largest_variance)
+        agrees = motion.chi_squared <= _STILL_GATE
+        if at_rest or (agrees and known < _STILL_SIGMA):
             graph.add(still)
 
     def _variance(
@@ -301,9 +308,13 @@ class KeyframeGraph:
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""
         graph: Any = self._smoother.getFactors()
-        window = [graph.at(k) for k in range(graph.size())]
-        equations = sum(factor.dim() for factor in window if factor is not None)
-        freedom = max(equations - self._values.dim(), 1)
+        equations = 0
+        for number in range(graph.size()):
+            factor = graph.at(number)
+            if factor is not None:
+                equations += factor.dim()
+        unknowns = self._values.dim()
+        freedom = max(equations - unknowns, 1)
         return 2.0 * graph.error(self._values) / freedom
 
     def smoothed(self) -> list[KeyframeState]:
@@ -411,7 +422,12 @@ class KeyframeGraph:
             first = len(known.seconds) - 1
         else:
             pim = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
-        self._integrate(pim, ImuInterval(*(samples[first:] for samples in interval)))
+        new = ImuInterval(
+            interval.seconds[first:],
+            interval.rates[first:],
+            interval.forces[first:],
+        )
+        self._integrate(pim, new)
         rate = _mean_rate(interval) - self._bias.gyroscope()
         self._step = _Step(interval, pim, rate)
         matrix = self.newest.doubts[self._doubts.gyro_matrix]
@@ -424,22 +440,21 @@ class KeyframeGraph:
 
     def _integrate(self, pim: Any, interval: ImuInterval) -> None:
         """Add samples to an integral, with their noise; knocks have more."""
-        eye = np.eye(3)
-        errors = self._noise
+        errors, params = self._noise, self._preintegration
         of_gyro = factors.gyro_variance(self._gyro_variance) + errors.gyro_errors**2
         of_accel = factors.accel_variance(self._imu) + errors.accel_errors**2
-        self._preintegration.setGyroscopeCovariance(of_gyro * eye)
-        self._preintegration.setAccelerometerCovariance(of_accel * eye)
+        params.setGyroscopeCovariance(of_gyro * _EYE)
+        params.setAccelerometerCovariance(of_accel * _EYE)
         steps = np.diff(interval.seconds)
         forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
         rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
         by_knocks = knocks(interval) ** 2 * steps
         for force, rate, seconds, more in zip(forces, rates, steps, by_knocks, strict=True):
             if more:
-                self._preintegration.setAccelerometerCovariance((of_accel + more) * eye)
+                params.setAccelerometerCovariance((of_accel + more) * _EYE)
             pim.integrateMeasurement(force, rate, seconds)
             if more:
-                self._preintegration.setAccelerometerCovariance(of_accel * eye)
+                params.setAccelerometerCovariance(of_accel * _EYE)
 
     def _linearised(self, step: _Step) -> tuple[Array, Array]:
         """How errors of the newest keyframe propagate, and the covariance of the samples.
@@ -449,13 +464,16 @@ class KeyframeGraph:
         factor = self._imu_factor(step)
         # A_i d_i + A_j d_j + A_d d is white noise.
         A, _ = factor.linearize(self._ahead).jacobian()
-        back = np.linalg.inv(A[:, _OF_SECOND])
-        of_doubts = A[:, factors.IMU['B2'].stop :]
+        first = A[:, _OF_FIRST]
+        second = A[:, _OF_SECOND]
+        of_doubts = A[:, _OF_DOUBTS]
+        back = np.linalg.inv(second)
         size = len(self.newest.covariance)
-        by, noise = np.eye(size), np.zeros((size, size))
-        by[:_OWN, :_OWN] = -back @ A[:, _OF_FIRST]
-        by[:_OWN, DOUBTS] = -back @ of_doubts
-        noise[:_OWN, :_OWN] = back @ back.T
+        by = np.eye(size)
+        by[_OWN, _OWN] = -back @ first
+        by[_OWN, DOUBTS] = -back @ of_doubts
+        noise = np.zeros((size, size))
+        noise[_OWN, _OWN] = back @ back.T
         return by, noise
 
     def _innovation(
@@ -470,23 +488,37 @@ class KeyframeGraph:
         by, noise = self._linearised(step)
         H, e = factor.linearize(self._ahead).jacobian()
         own = (H.shape[1] - self._doubts.size) // 2
+        of_first = H[:, :own]
+        of_second = H[:, own : 2 * own]
+        of_doubts = H[:, 2 * own :]
         second = np.zeros((len(e), len(by)))
-        second[:, :own] = H[:, own : 2 * own]
+        second[:, :own] = of_second
         whole = second @ by
-        whole[:, :own] += H[:, :own]
-        whole[:, DOUBTS] += H[:, 2 * own :]
-        predicted = whole @ self.newest.covariance @ whole.T + second @ noise @ second.T
-        # White noise of rate and acceleration in rotation, velocity and position of the second
-        # body. A rotation turns the mean specific force.
-        R = self._ahead.atPose3(X(self._count)).rotation().matrix()
-        of_rotation, of_place = second[:, ROTATION], second[:, TRANSLATION]
-        of_velocity = second[:, VELOCITY] @ R
+        whole[:, :own] += of_first
+        whole[:, DOUBTS] += of_doubts
+        of_state = whole @ self.newest.covariance @ whole.T
+        of_samples = second @ noise @ second.T
+        by_accel, by_gyro = self._by_white_noise(step, second)
+        return Innovation(e, of_state + of_samples, by_accel, by_gyro)
+
+    def _by_white_noise(self, step: _Step, second: Array) -> tuple[Array, Array]:
+        """Covariances (n, n) of errors by white noise of acceleration and rate of unit density.
+
+        `second`: derivatives (n, m) by the second body, whose rotation, velocity and position the
+        noise changes. A rotation turns the mean specific force.
+        """
         assert step.interval is not None
-        turned = -skew(step.interval.forces.mean(axis=0))
+        pose = self._ahead.atPose3(X(self._count))
+        R = pose.rotation().matrix()
+        of_rotation = second[:, ROTATION]
+        of_velocity = second[:, VELOCITY] @ R
+        of_place = second[:, TRANSLATION]
+        mean_force = step.interval.forces.mean(axis=0)
+        turned = -skew(mean_force)
         integrals = integrals_of_noise(step.interval.duration)
         by_accel = spread([of_velocity, of_place], integrals[:2, :2])
         by_gyro = spread([of_rotation, of_velocity @ turned, of_place @ turned], integrals)
-        return Innovation(e, predicted, by_accel, by_gyro)
+        return by_accel, by_gyro
 
     def _motions(self, interval: ImuInterval) -> tuple[Array, Array]:
         """Rates (2, 3) and specific forces (2, 3) of the body at the ends of an interval."""
@@ -516,17 +548,21 @@ class KeyframeGraph:
 
     def _read(self, newest: int) -> None:
         """Read the estimates of the smoother."""
-        values = self._values = self._smoother.calculateEstimate()
-        marginals = gtsam.Marginals(self._smoother.getFactors(), values)
-        self._bias = values.atConstantBias(B(newest))
+        values = self._smoother.calculateEstimate()
+        window = self._smoother.getFactors()
+        marginals = gtsam.Marginals(window, values)
+        self._values = values
         self.newest = _state(values, marginals, newest)
-        pose, velocity = values.atPose3(X(newest)), values.atVector(V(newest))
+        pose = values.atPose3(X(newest))
+        velocity = values.atVector(V(newest))
+        self._bias = values.atConstantBias(B(newest))
         self._nav_state = gtsam.NavState(pose, velocity)
         # The window, with a place for the prediction of the next keyframe.
-        self._ahead = gtsam.Values(values)
-        self._ahead.insert(X(newest + 1), pose)
-        self._ahead.insert(V(newest + 1), velocity)
-        self._ahead.insert(B(newest + 1), self._bias)
+        ahead = gtsam.Values(values)
+        ahead.insert(X(newest + 1), pose)
+        ahead.insert(V(newest + 1), velocity)
+        ahead.insert(B(newest + 1), self._bias)
+        self._ahead = ahead
         self._step = _NO_STEP
         if self._record is not None:
             self._record[1].insert_or_assign(values)

@@ -53,13 +53,15 @@ class KeyframeObservations(ArrayFile):
         """Observations in both images of a pair."""
         found, matches = pair.pose.inliers, pair.matches
         ids = matches.track_ids[found].astype(np.int64)
-        delays = np.concatenate([times[found] for times in matches.row_times])
         keyframes = np.repeat([pair.reference_ns1, pair.reference_ns2], len(ids))
+        delays = [times[found] for times in matches.row_times]
+        delays_ns = np.rint(NANOSECONDS * np.concatenate(delays)).astype(np.int64)
+        pixels = [matches.points1[found], matches.points2[found]]
         return cls(
             ids=np.tile(ids, 2),
             keyframes_ns=keyframes,
-            times_ns=keyframes + np.rint(NANOSECONDS * delays).astype(np.int64),
-            pixels=np.concatenate([matches.points1[found], matches.points2[found]]),
+            times_ns=keyframes + delays_ns,
+            pixels=np.concatenate(pixels),
         )
 
     @classmethod

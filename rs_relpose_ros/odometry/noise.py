@@ -123,49 +123,56 @@ class NoisePosterior:
         by_accel = more_accel[:, None, None] * innovation.by_accelerometer
         by_gyro = more_gyro[:, None, None] * innovation.by_gyro
         covariances = innovation.covariance + by_accel[:, None] + by_gyro
-        known, vectors = np.linalg.eigh(covariances)
-        squares = (innovation.errors @ vectors) ** 2
-        variances = np.maximum(known, 0.0)[..., None] + _PAIR_VARIANCES
-        misfits = squares[..., None] / variances + np.log(variances)
-        log = -0.5 * misfits.sum(axis=2)
+        log = _log_likelihoods(innovation.errors, covariances)
         kept = math.exp(-seconds / _FORGOTTEN)
         remembered = kept * self._log + (1.0 - kept) * _PRIOR
-        self._log = remembered + np.maximum(log - log.max(), -_ONE_PAIR)
+        worse = log - log.max()
+        self._log = remembered + np.maximum(worse, -_ONE_PAIR)
         self._observed += 1
         self._read()
 
     def _read(self) -> None:
         """Read the means from the posterior."""
-        weights = np.exp(self._log - self._log.max())
-        self._weights = weights / weights.sum()
-        of_accel = self._weights.sum(axis=(1, 2))
-        of_gyro = self._weights.sum(axis=(0, 2))
-        of_pair = self._weights.sum(axis=(0, 1))
-        self.accel_errors = math.sqrt(of_accel @ _ACCEL_ERRORS**2)
-        self.gyro_errors = math.sqrt(of_gyro @ _GYRO_ERRORS**2)
-        self.pair_variance = math.exp(of_pair @ np.log(_PAIR_VARIANCES))
+        likelihoods = np.exp(self._log - self._log.max())
+        weights = likelihoods / likelihoods.sum()
+        self._of_accel = weights.sum(axis=(1, 2))
+        self._of_gyro = weights.sum(axis=(0, 2))
+        of_pair = weights.sum(axis=(0, 1))
+        accel_variance = self._of_accel @ _ACCEL_ERRORS**2
+        gyro_variance = self._of_gyro @ _GYRO_ERRORS**2
+        pair_log = of_pair @ np.log(_PAIR_VARIANCES)
+        self.accel_errors = math.sqrt(accel_variance)
+        self.gyro_errors = math.sqrt(gyro_variance)
+        self.pair_variance = math.exp(pair_log)
 
     def findings(self, imu: ImuConfig) -> tuple[Finding, ...]:
         """Sensors whose noise is more than twice the configured one for certain."""
         if self._observed < _LEAST_NAMED:
             return ()
-        of_gyro = self._weights.sum(axis=(0, 2))
-        of_accel = self._weights.sum(axis=(1, 2))
-        found = [
-            _noise_finding(
-                Code.GYRO_NOISE,
-                imu.gyro_noise_density,
-                _GYRO_ERRORS,
-                of_gyro,
-            ),
-            _noise_finding(
-                Code.ACCEL_NOISE,
-                imu.accel_noise_density,
-                _ACCEL_ERRORS,
-                of_accel,
-            ),
-        ]
-        return tuple(finding for finding in found if finding is not None)
+        gyro = _noise_finding(
+            Code.GYRO_NOISE,
+            imu.gyro_noise_density,
+            _GYRO_ERRORS,
+            self._of_gyro,
+        )
+        accel = _noise_finding(
+            Code.ACCEL_NOISE,
+            imu.accel_noise_density,
+            _ACCEL_ERRORS,
+            self._of_accel,
+        )
+        return tuple(finding for finding in (gyro, accel) if finding is not None)
+
+
+def _log_likelihoods(errors: Array, covariances: Array) -> Array:
+    """Log likelihoods (A, G, P) of errors (n,) by covariances (A, G, n, n) and pair variances."""
+    known, vectors = np.linalg.eigh(covariances)
+    squares = (errors @ vectors) ** 2
+    of_state = np.maximum(known, 0.0)
+    variances = of_state[..., None] + _PAIR_VARIANCES
+    misfits = squares[..., None] / variances
+    terms = misfits + np.log(variances)
+    return np.asarray(-0.5 * terms.sum(axis=2))
 
 
 # Parameter and unit of the density of each noise.
@@ -210,13 +217,15 @@ def knocks(interval: ImuInterval) -> Array:
 
     The peak of a knock is between the samples, or beyond the range of the accelerometer.
     """
-    forces = interval.forces
-    jumps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
-    sizes = np.linalg.norm(forces, axis=1)
-    is_knock = jumps > _KNOCK
+    jumps = np.linalg.norm(np.diff(interval.forces, axis=0), axis=1)
     sigmas = np.zeros(len(jumps))
-    for k in np.flatnonzero(is_knock):
-        around = slice(max(k - _AROUND_KNOCK, 0), k + _AROUND_KNOCK + 1)
+    numbers = np.flatnonzero(jumps > _KNOCK)
+    if not len(numbers):
+        return sigmas
+    sizes = np.linalg.norm(interval.forces, axis=1)
+    for k in numbers:
+        first = max(k - _AROUND_KNOCK, 0)
+        around = slice(first, k + _AROUND_KNOCK + 1)
         peak = max(jumps[k], sizes[k], sizes[k + 1])
         sigmas[around] = np.maximum(sigmas[around], peak)
     return sigmas

@@ -210,18 +210,20 @@ class RowTrajectory(ArrayFile):
         It is that of the keyframes, linear in between. The mounting is taken as exact.
         """
         mount = self._mount(frame)
+        base_mount = self._mount(BASE)
         times = self._covered(t_ns)
         knots = self.keyframes_ns[:, 1]
         k, share = _between_stamps(knots, times)
         share = share[..., None, None]
-        covariance = (1.0 - share) * self.covariances[k] + share * self.covariances[k + 1]
+        before, after = self.covariances[k], self.covariances[k + 1]
+        covariance = (1.0 - share) * before + share * after
         # The position of a frame beside the base also changes with the rotation of the base.
         R, _, _, _ = self._imu_at(times)
-        beside = mount[:, 3] - self.mounts[FRAMES.index(BASE), :, 3]
-        arm = R @ beside
+        arm = R @ (mount[:, 3] - base_mount[:, 3])
         by = np.broadcast_to(np.eye(6), covariance.shape).copy()
         by[..., :3, 3:] = -np.cross(np.eye(3), arm[..., None, :])
-        return np.asarray(by @ covariance @ np.swapaxes(by, -1, -2))
+        transposed = np.swapaxes(by, -1, -2)
+        return np.asarray(by @ covariance @ transposed)
 
     def camera_ns(self, t_ns: ArrayLike) -> Stamps:
         """Times on the clock of the camera, as of image stamps."""
@@ -255,25 +257,25 @@ class RowTrajectory(ArrayFile):
             nothing = np.zeros((*shape, 3))
             return np.zeros((*shape, 3, 3)), nothing, nothing, nothing
         k, share = _between_stamps(self.stamps_ns, times)
-        step = (self.stamps_ns[k + 1] - self.stamps_ns[k])[..., None] / NANOSECONDS
+        duration_ns = self.stamps_ns[k + 1] - self.stamps_ns[k]
+        step = duration_ns[..., None] / NANOSECONDS
         share = share[..., None]
         rate1, rate2 = self.rates[k], self.rates[k + 1]
         velocity1, velocity2 = self.velocities[k], self.velocities[k + 1]
         # Between samples rotation and position are cubic polynomials with the values and the
         # derivatives of both samples.
-        first = Rotation.from_quat(self.quats_xyzw[k].reshape(-1, 4))
-        second = Rotation.from_quat(self.quats_xyzw[k + 1].reshape(-1, 4))
+        quats1 = self.quats_xyzw[k].reshape(-1, 4)
+        quats2 = self.quats_xyzw[k + 1].reshape(-1, 4)
+        first, second = Rotation.from_quat(quats1), Rotation.from_quat(quats2)
         turn = (first.inv() * second).as_rotvec().reshape(*shape, 3)
-        turned = _cubic(share, step, turn, rate1, rate2).reshape(-1, 3)
-        R = (first * Rotation.from_rotvec(turned)).as_matrix().reshape(*shape, 3, 3)
-        way = self.positions[k + 1] - self.positions[k]
-        moved = _cubic(share, step, way, velocity1, velocity2)
-        return (
-            R,
-            self.positions[k] + moved,
-            velocity1 + share * (velocity2 - velocity1),
-            rate1 + share * (rate2 - rate1),
-        )
+        turned = _cubic(share, step, turn, rate1, rate2)
+        at_time = first * Rotation.from_rotvec(turned.reshape(-1, 3))
+        R = at_time.as_matrix().reshape(*shape, 3, 3)
+        position1, position2 = self.positions[k], self.positions[k + 1]
+        moved = _cubic(share, step, position2 - position1, velocity1, velocity2)
+        velocity = velocity1 + share * (velocity2 - velocity1)
+        rate = rate1 + share * (rate2 - rate1)
+        return R, position1 + moved, velocity, rate
 
 
 def _between_stamps(stamps: Stamps, times: Stamps) -> tuple[Stamps, Array]:
@@ -332,11 +334,13 @@ def _between(
     turns = integrated_rotations(interval.seconds, np.ascontiguousarray(rates))
     by_gyro = Rotation.from_matrix(one.R @ turns)
     # The error of the rotation at the second keyframe is spread as a constant rate.
-    error = log_so3(by_gyro[-1].as_matrix().T @ two.R)
+    last_R = by_gyro[-1].as_matrix()
+    error = log_so3(last_R.T @ two.R)
     closing = Rotation.from_rotvec(share * error)
     R = by_gyro * closing
     forces = R.apply(interval.forces - one.accel_bias)
-    once, twice = force_integrals(np.diff(interval.seconds), forces)
+    steps = np.diff(interval.seconds)
+    once, twice = force_integrals(steps, forces)
     velocity = one.velocity + once + seconds * _GRAVITY
     position = one.position + seconds * one.velocity + twice + 0.5 * seconds**2 * _GRAVITY
     # The errors of position and velocity there are spread as a cubic polynomial.
@@ -346,9 +350,9 @@ def _between(
     position = position + share**2 * (3.0 * way - change + share * bend)
     slope = 6.0 * way - 2.0 * change + 3.0 * share * bend
     velocity = velocity + share * slope / duration
-    stamps = one.imu_ns + np.rint(NANOSECONDS * interval.seconds).astype(np.int64)
-    rates = closing.inv().apply(rates) + error / duration
-    return stamps, R.as_quat(), position, velocity, rates
+    since_ns = np.rint(NANOSECONDS * interval.seconds).astype(np.int64)
+    turning = closing.inv().apply(rates) + error / duration
+    return one.imu_ns + since_ns, R.as_quat(), position, velocity, turning
 
 
 # -- files of poses ---------------------------------------------------------------------------

@@ -105,20 +105,23 @@ def end_without_samples(end: PathEnd, state: KeyframeState, seconds: float) -> P
 
     The body has moved on at its velocity, within the accelerations and rates of a hand.
     """
-    unknown_way = 0.0
     position = end.position
+    unknown_way = 0.0
     if seconds > 0.0:
         position = position + seconds * state.velocity
     else:
         seconds = _UNKNOWN_TIME
-        unknown_way = seconds * float(np.linalg.norm(state.velocity))
+        speed = float(np.linalg.norm(state.velocity))
+        unknown_way = seconds * speed
     moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2 + unknown_way
     turned = _UNKNOWN_RATE * seconds
+    of_velocity = state.covariance[VELOCITY, VELOCITY]
     covariance = end.covariance.copy()
     covariance[:3, :3] += moved**2 * np.eye(3)
-    covariance[:3, :3] += seconds**2 * state.covariance[VELOCITY, VELOCITY]
+    covariance[:3, :3] += seconds**2 * of_velocity
     # A heading that is wrong by more than half a turn is any heading.
-    covariance[3, 3] = min(covariance[3, 3] + turned**2, math.pi**2)
+    of_heading = covariance[3, 3] + turned**2
+    covariance[3, 3] = min(of_heading, math.pi**2)
     return PathEnd(end.R, position, covariance)
 
 

@@ -74,18 +74,22 @@ class Base(NamedTuple):
         arm = base.R @ self.position
         by_pose = np.eye(6)
         by_pose[:3, 3:] = -skew(arm)
+        to_camera = self.R.T
         by_twist = np.zeros((6, 6))
-        by_twist[:3, :3] = by_twist[3:, 3:] = self.R.T
-        by_twist[:3, 3:] = -self.R.T @ skew(self.position)
+        by_twist[:3, :3] = to_camera
+        by_twist[3:, 3:] = to_camera
+        by_twist[:3, 3:] = -to_camera @ skew(self.position)
         swing = np.cross(base.angular_velocity, self.position)
+        pose_covariance = by_pose @ base.pose_covariance @ by_pose.T
+        velocity_covariance = by_twist @ base.velocity_covariance @ by_twist.T
         return replace(
             base,
             R=base.R @ self.R,
             position=base.position + arm,
-            pose_covariance=by_pose @ base.pose_covariance @ by_pose.T,
-            velocity=self.R.T @ (base.velocity + swing),
-            angular_velocity=self.R.T @ base.angular_velocity,
-            velocity_covariance=by_twist @ base.velocity_covariance @ by_twist.T,
+            pose_covariance=pose_covariance,
+            velocity=to_camera @ (base.velocity + swing),
+            angular_velocity=to_camera @ base.angular_velocity,
+            velocity_covariance=velocity_covariance,
         )
 
 
