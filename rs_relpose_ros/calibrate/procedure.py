@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import logging
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
-from rs_relpose_ros.calibration import errors, fit, model, observations
+from rs_relpose_ros.calibration import errors, fit, model, observations, repeated
 from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.calibration.findings_text import with_sigma
 from rs_relpose_ros.calibration.observations import (
@@ -92,7 +92,54 @@ def calibrate(
     InputError if the recording cannot be used, with what to record instead.
     """
     config = CalibrationConfig() if config is None else config
-    R_prior = None if quat_prior is None else Rotation.from_quat(quat_prior).as_matrix()
+    found = fitted(
+        tracks,
+        gyro,
+        camera,
+        config,
+        focal_known=focal_known,
+        lens_given=lens_given,
+        R_prior=rotation_of(quat_prior),
+        rng=rng,
+        progress=progress,
+    )
+    return result_of(found, config, rotation_of(quat_prior))
+
+
+def rotation_of(quat_xyzw: Sequence[float] | None) -> Array | None:
+    """Rotation matrix (3, 3) of a quaternion, None without one."""
+    return None if quat_xyzw is None else Rotation.from_quat(quat_xyzw).as_matrix()
+
+
+class Fitted(NamedTuple):
+    """The fit to one recording, with its data and the cost over the readout time."""
+
+    data: Observations
+    final: fit.Fit
+    curve: Array
+
+
+def result_of(
+    found: Fitted, config: CalibrationConfig, R_prior: Array | None
+) -> CalibrationResult:
+    """Result of a fit, joined with the rotation of a transform."""
+    final, axes_known = _with_axes(found.data, found.final, R_prior)
+    return evaluated(found.data, final, found.curve, config, axes_known=axes_known)
+
+
+def fitted(
+    tracks: TrackedPoints,
+    gyro: GyroSeries,
+    camera: RollingShutterCamera,
+    config: CalibrationConfig,
+    *,
+    focal_known: bool,
+    lens_given: bool,
+    R_prior: Array | None,
+    rng: np.random.Generator | int = 0,
+    progress: Callable[[float], object] = lambda share: None,
+) -> Fitted:
+    """The fit of `calibrate`, before it is evaluated."""
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(
             f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
@@ -118,7 +165,7 @@ def _calibrated(
     config: CalibrationConfig,
     rng: np.random.Generator,
     progress: Callable[[float], object],
-) -> CalibrationResult:
+) -> Fitted:
     """The calibration of a usable recording: coarse, with some pairs, then with all pairs.
 
     `about` gives the observations with a deviation of the lens.
@@ -147,8 +194,7 @@ def _calibrated(
         data.interval,
         lambda share: progress(0.8 + 0.2 * share),
     )
-    final, axes_known = _with_axes(data, final, R_prior)
-    return evaluated(data, final, curve, config, axes_known=axes_known)
+    return Fitted(data, final, curve)
 
 
 def warm_up_fit() -> None:
@@ -300,6 +346,59 @@ def _fit_with_lens(
             break
     assert found is not None
     return data, found
+
+
+# -- Several recordings of one camera -----------------------------------------------------------
+
+
+class CommonResult(NamedTuple):
+    """Calibration of several recordings of one camera."""
+
+    result: CalibrationResult  # what they have in common, for another recording of the camera
+    of_recordings: tuple[CalibrationResult, ...]
+    between: dict[str, list[float]]  # 1 sigma of each parameter between recordings
+
+
+def calibrate_together(
+    recordings: Sequence[CalibrationInput],
+    config: CalibrationConfig,
+    *,
+    quat_prior: Sequence[float] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
+) -> CommonResult:
+    """Calibration of at least two recordings of one camera; see `calibration.repeated`.
+
+    InputError if the cameras differ.
+    """
+    for other in recordings[1:]:
+        if other.camera != recordings[0].camera or other.focal_known != recordings[0].focal_known:
+            raise InputError(
+                'the recordings have different CameraInfo or image sizes: calibrate bags of one '
+                'camera at one resolution together, others each alone'
+            )
+    R_prior, count = rotation_of(quat_prior), len(recordings)
+    found = [
+        recording.fitted(
+            config,
+            R_prior=R_prior,
+            progress=lambda share, k=k: progress((k + share) / count),
+        )
+        for k, recording in enumerate(recordings)
+    ]
+    fits = [one.final for one in found]
+    reference = int(np.argmax([one.problem.begin[-1] for one in fits]))
+    lenses = np.array([one.data.lens for one in found])
+    common = repeated.combined(fits, lenses, reference)
+    result = result_of(found[reference]._replace(final=common.fit), config, R_prior)
+    results = tuple(result_of(one, config, R_prior) for one in found)
+    total = replace(
+        result,
+        frames=sum(one.frames for one in results),
+        pairs=sum(one.pairs for one in results),
+        matches=sum(one.matches for one in results),
+    )
+    between = {name: common.between[part].tolist() for name, part in OFFLINE.parts.items()}
+    return CommonResult(total, results, between)
 
 
 # -- Result of a fit, and observability --------------------------------------------------------
@@ -614,6 +713,18 @@ class CalibrationInput:
             focal_known=self.focal_known,
             lens_given=self.lens_given,
             config=config,
+            **options,
+        )
+
+    def fitted(self, config: CalibrationConfig, **options: Any) -> Fitted:
+        """Its fit; `options` of `fitted`."""
+        return fitted(
+            self.tracks,
+            self.gyro,
+            self.camera,
+            config,
+            focal_known=self.focal_known,
+            lens_given=self.lens_given,
             **options,
         )
 

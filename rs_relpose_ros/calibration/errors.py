@@ -97,11 +97,11 @@ def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior
     sums = np.stack([scores[groups == name].sum(axis=0) for name in names])
     of_groups = np.stack([curvatures[groups == name].sum(axis=0) for name in names])
     # Scores add up to the pull of the prior, which is no scatter.
-    scatter = math.sqrt(_of_few_groups(len(names))) * (sums - sums.mean(axis=0))
+    scatter = math.sqrt(of_few_groups(len(names))) * (sums - sums.mean(axis=0))
     return np.asarray(grouped_covariance(scatter, of_groups, prior, JACKKNIFE))
 
 
-def _of_few_groups(count: int) -> float:
+def of_few_groups(count: int) -> float:
     """Factor of the variance of a jackknife over a number of groups.
 
     The scatter of few groups is uncertain, so that errors in sigmas follow Student's t: widened,
@@ -146,21 +146,24 @@ def widened(final: Fit, doubts: Doubts | None = None) -> Fit:
     wider = np.sqrt(_between_regions(final) * _disagreement(final))
     scatter = final.covariance * np.outer(wider, wider)
     if doubts is not None:
-        scatter[final.block] += _of_doubts(final, doubts.parameters)
-        scatter[final.block] += _of_tangential(final, doubts.tangential)
+        by_parameters = _by_parameters(final, doubts.parameters)
+        by_tangential = _by_tangential(final, doubts.tangential)
+        by_doubt = np.zeros((GLOBAL, by_parameters.shape[1] + by_tangential.shape[1]))
+        by_doubt[final.free] = np.hstack([by_parameters, by_tangential])
+        scatter += by_doubt @ by_doubt.T
+        final = replace(final, by_doubt=by_doubt)
     return replace(final, covariance=scatter)
 
 
-def _of_doubts(final: Fit, doubts: Array) -> Array:
-    """Covariance (k, k) of the free parameters by the doubts of others."""
+def _by_parameters(final: Fit, doubts: Array) -> Array:
+    """Moves (k, m) of the free parameters by one sigma of each of m doubted ones."""
     doubted = (doubts > 0.0) & ~final.free
     both = final.free | doubted
     at = evaluate(final.problem, final.unknowns, both)
     H, _ = normal_equations(final.problem, at, final.unknowns, both)
     is_free = final.free[both]
     moves = np.linalg.solve(H[np.ix_(is_free, is_free)], H[np.ix_(is_free, ~is_free)])
-    moves = moves * doubts[doubted]
-    return np.asarray(moves @ moves.T)
+    return np.asarray(moves * doubts[doubted])
 
 
 # Share of a doubt for which derivatives are differences. [chosen: residuals change by less than
@@ -168,8 +171,8 @@ def _of_doubts(final: Fit, doubts: Array) -> Array:
 _SMALL = 0.01
 
 
-def _of_tangential(final: Fit, sigma: float) -> Array:
-    """Covariance (k, k) of the free parameters by the doubt of p1 and p2."""
+def _by_tangential(final: Fit, sigma: float) -> Array:
+    """Moves (k, 2) of the free parameters by one sigma of p1 and of p2."""
     problem, unknowns, free = final.problem, final.unknowns, final.free
     H, _ = normal_equations(problem, final.evaluation, unknowns, free)
     x, y = problem.points[..., 0], problem.points[..., 1]
@@ -182,8 +185,7 @@ def _of_tangential(final: Fit, sigma: float) -> Array:
         moved = problem._replace(points=problem.points - _SMALL * sigma * displacement)
         there = evaluate(moved, unknowns, free).score.sum(axis=0)
         gradients.append((there - here) / _SMALL)
-    moves = np.linalg.solve(H, np.transpose(gradients))
-    return np.asarray(moves @ moves.T)
+    return np.asarray(np.linalg.solve(H, np.transpose(gradients)))
 
 
 def _between_regions(final: Fit) -> Array:
@@ -210,7 +212,7 @@ def _between_regions(final: Fit) -> Array:
         cells += [own[stretch == k].sum(axis=0) for k in np.unique(stretch)]
     H = curve * whole.reduced.sum(axis=0) + problem.prior[final.block]
     adjusted = adjusted_scores(np.array(scores), np.array(curvatures), H, JACKKNIFE)
-    of_regions = adjusted.T @ adjusted * _of_few_groups(len(adjusted))
+    of_regions = adjusted.T @ adjusted * of_few_groups(len(adjusted))
     of_cells = np.transpose(cells) @ np.array(cells)
     covariance = inverse(H)
     beyond = np.diag(covariance @ (of_regions - of_cells) @ covariance)

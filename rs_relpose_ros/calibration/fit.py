@@ -430,6 +430,8 @@ class Fit:
     converged: bool
     # (k,) minus Newton's step that was left, if it has not converged.
     left: Array
+    # (GLOBAL, m) moves by one sigma of each doubt that the covariance contains.
+    by_doubt: Array
 
     @property
     def information(self) -> Array:
@@ -480,7 +482,8 @@ def minimised(
     weights = np.asarray(geman_mcclure_weight((final.residuals / limits) ** 2))
     left = np.zeros_like(at.newton) if converged else at.newton
     nothing = np.zeros((GLOBAL, GLOBAL))
-    return Fit(problem, unknowns, free, weights, nothing, final, converged, left)
+    none = np.zeros((GLOBAL, 0))
+    return Fit(problem, unknowns, free, weights, nothing, final, converged, left, none)
 
 
 def _descended(problem: Problem, unknowns: Unknowns, free: Flags, rounds: int) -> _Iterate:

@@ -1,7 +1,7 @@
 """Commands `calibrate`, `check`, `convert` and `unroll`: recordings before the estimation."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import logging
 from pathlib import Path
@@ -14,7 +14,7 @@ from rs_relpose_ros.bags.convert.euroc import read_euroc
 from rs_relpose_ros.bags.convert.recording import Recording, write_bag
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
 from rs_relpose_ros.calibrate import result as calibration
-from rs_relpose_ros.calibrate.procedure import read_recording
+from rs_relpose_ros.calibrate.procedure import calibrate_together, CalibrationInput, read_recording
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
@@ -55,7 +55,63 @@ def calibrate_bag(
     tracking, config = _calibration_settings(args)
     folder = options.out_folder(args, 'calibration')
     refuse_unwritable(folder)
-    with open_bag(args.bag) as bag:
+    read = [_recording(args, path, tracking) for path in (args.bag, *getattr(args, 'more', ()))]
+    first = read[0]
+    recording, frames = first.recording, first.frames
+    result, extra = _fitted(read, config)
+    prepare_folder(folder, _CALIBRATION_FILES)
+    names = ' '.join(one.path.name for one in read)
+    text = calibration.parameter_file(
+        result,
+        f'Parameters of relpose_node from `rs_relpose calibrate {names}`.',
+        camera=recording.camera,
+        compressed=first.compressed,
+        feature_rows=tuple(args.rows),
+        placed=_extrinsics(result, frames),
+    )
+    mapping = calibration.as_mapping(result, recording.camera) | extra
+    parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
+    for path, content in ((parameters, text), (metrics, json_text(mapping, indent=1))):
+        with written(path) as file:
+            file.write(content)
+    calibration.draw_curve(result, curve)
+    return result, recording.camera
+
+
+class _Read(NamedTuple):
+    """A bag that was read for a calibration."""
+
+    path: Path
+    recording: CalibrationInput
+    frames: BagFrames
+    compressed: bool  # whether its images are
+
+
+def _fitted(
+    read: Sequence[_Read], config: settings.CalibrationConfig
+) -> tuple[calibration.CalibrationResult, dict[str, Any]]:
+    """The calibration of all bags, and what the JSON file has of several bags besides."""
+    frames = read[0].frames
+    quat_prior = frames.imu_in_camera and frames.imu_in_camera[3:]
+    recordings = [one.recording for one in read]
+    with options.progress_bar(100, '%', 'fitting') as bar:
+
+        def progress(share: float) -> None:
+            bar.update(round(100 * share) - bar.n)
+
+        if len(read) == 1:
+            return recordings[0].calibrated(config, quat_prior=quat_prior, progress=progress), {}
+        common = calibrate_together(recordings, config, quat_prior=quat_prior, progress=progress)
+    of_bags = [
+        {'bag': one.path.name, **calibration.as_mapping(own, one.recording.camera)}
+        for one, own in zip(read, common.of_recordings, strict=True)
+    ]
+    return common.result, {'between_recordings': common.between, 'recordings': of_bags}
+
+
+def _recording(args: argparse.Namespace, path: Path, tracking: settings.TrackingConfig) -> _Read:
+    """Read a bag; InputError if the chosen rows are not in its images."""
+    with open_bag(path) as bag:
         topics = bag.find_topics(options.topic_options(args), needs_camera_info=False)
         with options.image_progress(bag, topics.image, 'tracking'):
             recording = read_recording(bag, topics, tracking)
@@ -69,28 +125,7 @@ def calibrate_bag(
             f'{recording.camera.height} rows: give the first and the last to use'
         )
     options.warn_unused(recording.unused)
-    with options.progress_bar(100, '%', 'fitting') as bar:
-        result = recording.calibrated(
-            config,
-            quat_prior=frames.imu_in_camera and frames.imu_in_camera[3:],
-            progress=lambda share: bar.update(round(100 * share) - bar.n),
-        )
-    prepare_folder(folder, _CALIBRATION_FILES)
-    text = calibration.parameter_file(
-        result,
-        f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
-        camera=recording.camera,
-        compressed=topics.image.msgtype == COMPRESSED_IMAGE,
-        feature_rows=tuple(args.rows),
-        placed=_extrinsics(result, frames),
-    )
-    mapping = calibration.as_mapping(result, recording.camera)
-    parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
-    for path, content in ((parameters, text), (metrics, json_text(mapping, indent=1))):
-        with written(path) as file:
-            file.write(content)
-    calibration.draw_curve(result, curve)
-    return result, recording.camera
+    return _Read(path, recording, frames, topics.image.msgtype == COMPRESSED_IMAGE)
 
 
 def _calibration_settings(
@@ -152,6 +187,13 @@ CALIBRATE = Command(
     options.declared(
         {
             **options.BAG,
+            'more': {
+                'metavar': 'BAG',
+                'nargs': '*',
+                'type': Path,
+                'help': 'further bags of the same camera: the values are those of all bags, their '
+                'sigmas cover how the bags differ',
+            },
             **options.out('calibration'),
             '--rows': {
                 'metavar': ('FIRST', 'LAST'),
