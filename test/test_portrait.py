@@ -1,17 +1,27 @@
 """A camera whose images are turned by 90 degrees, against the same camera with upright rows."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from test_frames_between import CAMERA, Scene, TIMES
+import test_monitor
+from test_monitor import NONE
 
+from rs_relpose_lab.experiments.calibration_tracks import record, Truth
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.render import Renderer
 from rs_relpose_lab.simulation.turned import turned_axes, turned_camera, turned_pixels
-from rs_relpose_ros import FrameMotion, InertialMotion
+from rs_relpose_ros import FrameMotion, InertialMotion, RollingShutterCamera
+from rs_relpose_ros.calibrate.procedure import calibrate
+from rs_relpose_ros.calibrate.result import parameter_file
+from rs_relpose_ros.calibration.findings import Code, FindingState
+from rs_relpose_ros.calibration.findings_text import line
+from rs_relpose_ros.calibration.readout_direction import ReadoutDirections, turned_cameras
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.estimator.problem import build_problem
 
 # Quarter turns to the left, and the direction of the readout afterwards.
@@ -177,7 +187,11 @@ def test_pose_is_that_of_the_twin(turns, frames):
     twin = Twin(scene, turns)
     expected = scene.pose(**{} if frames == 'all' else {'between': ()})
     found = scene.pose(**twin.arguments(), between=twin.between() if frames == 'all' else ())
-    assert expected.frames == found.frames == (len(TIMES) if frames == 'all' else 2)
+    assert (
+        expected.diagnostics.frames
+        == found.diagnostics.frames
+        == (len(TIMES) if frames == 'all' else 2)
+    )
     R = twin.R
     sigmas = np.sqrt(np.diag(expected.covariance))
     turned = R @ found.R @ R.T
@@ -206,6 +220,92 @@ def test_rows_in_place_of_columns_are_wrong(turns):
     off = Rotation.from_matrix(turned @ scene.R.T).as_rotvec()
     sigmas = np.sqrt(np.diag(scene.pose(between=()).covariance))[3:]
     assert not found or np.abs(off / sigmas).max() > 3.0
+
+
+# -- calibration ----------------------------------------------------------------------------------
+
+
+# Camera of the simulated tracks, as assumed by a calibration.
+CAMERA_OF_TRACKS = RollingShutterCamera(
+    width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5, readout_time=0.0
+)
+
+
+@cache
+def walk():
+    """Tracks of a walk, and their calibration."""
+    recorded = record(Truth(frames=90, focal=640.0), np.random.default_rng(11))
+    return recorded, calibrate(recorded.tracks, recorded.gyro, CAMERA_OF_TRACKS)
+
+
+def test_calibration_finds_columns(turns, direction, tmp_path):
+    """Without a hint, and as exactly as from the upright images.
+
+    The sigmas of 3 s are by few stretches, so that they scatter themselves.
+    """
+    recorded, expected = walk()
+    camera = CAMERA_OF_TRACKS
+    points = turned_pixels(recorded.tracks.points, camera, turns)
+    tracks = replace(recorded.tracks, points=points)
+    turned = turned_camera(camera, turns)
+    found = calibrate(tracks, recorded.gyro, replace(turned, readout_direction='down'))
+    assert expected.readout_direction == 'down'
+    assert found.readout_direction == direction and found.observable
+    sign = 1.0 if direction == 'right' else -1.0
+    truth = recorded.truth
+    assert abs(sign * found.readout_time.value - truth.readout_time) < (
+        3.0 * found.readout_time.sigma
+    )
+    # The offset is that of column 0, which is read last if the readout goes to the left.
+    last_row = truth.readout_time * 719.0 / 720.0
+    of_column_0 = truth.time_offset + (0.0 if direction == 'right' else last_row)
+    assert abs(found.time_offset.value - of_column_0) < 3.0 * found.time_offset.sigma
+    R = turned_axes(turns).T @ truth.R_cam_imu
+    off = Rotation.from_matrix(found.R_cam_imu @ R.T).as_rotvec()
+    assert (np.abs(off) < 3.5 * found.rotation_sigma).all()
+    for name in ('readout_time', 'time_offset', 'rotation'):
+        assert getattr(found, name).sigma < 1.5 * getattr(expected, name).sigma
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(parameter_file(found, 'Turned.', camera=turned), encoding='utf-8')
+    sensor = read_parameters(path).sensor
+    assert sensor.readout_direction == direction and sensor.stamp_row == 'first'
+
+
+# -- the monitor ----------------------------------------------------------------------------------
+
+
+def compared(true, monkeypatch, deviation=None):
+    """Findings on pairs that `true` exposed, with the configuration of the monitor's tests."""
+    monkeypatch.setattr(test_monitor, 'deviating', lambda camera, c: true)
+    rng, directions = np.random.default_rng(4), ReadoutDirections()
+    for k in range(9):
+        pair = test_monitor.pair_data(0.4 * k, 0.4 * k + 0.3, NONE)
+        noise = rng.normal(0.0, 0.2, (2, *pair.points1.shape))
+        pair = replace(pair, points1=pair.points1 + noise[0], points2=pair.points2 + noise[1])
+        directions.add(k, pair, NONE if deviation is None else deviation)
+    return directions.findings(test_monitor.CAMERA)
+
+
+@pytest.mark.parametrize('side', [0, 1], ids=list(TURNS))
+def test_columns_are_named_with_what_to_set(side, monkeypatch):
+    true = turned_cameras(test_monitor.CAMERA)[side]
+    (finding,) = compared(true, monkeypatch)
+    expected = [('right', 'first'), ('left', 'last')][side]
+    assert finding.code is Code.READOUT_DIRECTION and finding.state is FindingState.WRONG
+    assert tuple(finding.settings.values()) == expected
+    assert finding.evidence.log_likelihood > 5.0
+    assert f'set readout_direction: {expected[0]} and stamp_row: {expected[1]}' in line(finding)
+
+
+def test_rows_are_not_taken_for_columns(monkeypatch):
+    """Neither with the right readout, nor with one that a deviation explains."""
+    camera = test_monitor.CAMERA
+    assert compared(camera, monkeypatch) == ()
+    shorter = replace(camera, readout_time=0.01)
+    by_readout = test_monitor.deviation(readout_time=-0.02)
+    assert compared(shorter, monkeypatch, by_readout) == ()
+    upwards = camera.with_signed_readout_time(-0.03)
+    assert compared(upwards, monkeypatch, test_monitor.deviation(readout_time=-0.06)) == ()
 
 
 # -- simulation -----------------------------------------------------------------------------------

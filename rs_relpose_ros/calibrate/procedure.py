@@ -25,6 +25,7 @@ from rs_relpose_ros.calibration.observations import (
     PairSelection,
     TrackedPoints,
 )
+from rs_relpose_ros.calibration.readout_axis import along_other_axis
 from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.core.deviations import by_name, OFFLINE
@@ -87,9 +88,10 @@ def calibrate(
     used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
     `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,
     radial distortion (k1, k2, k3) and principal point are estimated; with `lens_given` about a
-    distortion that is given. `rng` selects matches if
-    there are more than needed; `progress` is called with the finished share of the work.
-    InputError if the recording cannot be used, with what to record instead.
+    distortion that is given. Rows of the sensor are rows of the image, or columns where these fit
+    better for certain. `rng` selects matches if there are more than needed; `progress` is called
+    with the finished share of the work. InputError if the recording cannot be used, with what to
+    record instead.
     """
     config = CalibrationConfig() if config is None else config
     found = fitted(
@@ -168,7 +170,7 @@ def _calibrated(
 ) -> Fitted:
     """The calibration of a usable recording: coarse, with some pairs, then with all pairs.
 
-    `about` gives the observations with a deviation of the lens.
+    `data` are the observations as assumed, `about` gives them with a deviation of the lens.
     """
     free = OFFLINE.mask('axes', 'time_offset', 'readout_time', 'gyro_bias')
     free[model.FOCAL] = not focal_known
@@ -184,7 +186,8 @@ def _calibrated(
     progress(0.7)
     doubts = None
     if config.exposed:
-        doubts = errors.doubts(data.camera.width, lens_known=focal_known)
+        longer_side = max(data.camera.width, data.camera.height)
+        doubts = errors.doubts(longer_side, lens_known=focal_known)
     final = errors.widened(final, doubts)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
@@ -288,7 +291,10 @@ def _coarse_fit(
     config: CalibrationConfig,
     rng: np.random.Generator,
 ) -> tuple[Observations, model.Unknowns]:
-    """The best of the fits to a few pairs from each of the starts, and its data."""
+    """The best of the fits to a few pairs from each of the starts, and its data.
+
+    With rows along the axis of the image that fits.
+    """
     pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
@@ -311,13 +317,16 @@ def _coarse_fit(
         raise InputError('the gyro does not cover the images: record both together')
     fits = []
     for start in starts:
-        data = about(np.log(start.focal_factor) * np.eye(N_LENS)[0])
-        problem = data.selected_problem(_PAIRS_AT_START, start.offset, rng)
+        lens = np.log(start.focal_factor) * np.eye(N_LENS)[0]
+        data = about(lens)
+        chosen = data.selected_pairs(_PAIRS_AT_START, start.offset, rng)
+        problem = data.problem(chosen, start.offset)
         unknowns = fit.initial(problem, start.R_cam_imu, start.offset)
         coarse = fit.minimised(problem, unknowns, free, rounds=20, tolerance=0.3)
-        fits.append((data, coarse.unknowns))
+        fits.append((data, chosen, coarse))
     # By the noise of the matches: pairs and cost differ between the starts.
-    return min(fits, key=lambda found: float(np.median(found[1].noise)))
+    data, chosen, best = min(fits, key=lambda one: float(np.median(one[2].unknowns.noise)))
+    return along_other_axis(data, chosen, best, free) or (data, best.unknowns)
 
 
 def _fit_with_lens(
@@ -331,7 +340,8 @@ def _fit_with_lens(
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
     seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
     for _ in range(_LENS_ROUNDS):
-        data = about(data.lens + coarse.parameters[model.LENS])
+        moved = about(data.lens + coarse.parameters[model.LENS])
+        data = moved.along(data.camera.readout_axis)
         problem = data.selected_problem(selection, offset, np.random.default_rng(seed))
         if found is not None and np.array_equal(problem.rows[0], found.problem.rows[0]):
             # The same matches: only the lens is linearised again.

@@ -453,6 +453,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'observable': result.observable,
         'shutter': result.shutter,
         'readout_time_s': asdict(result.readout_time),
+        'readout_direction': result.readout_direction,
         'time_offset_s': asdict(result.time_offset),
         'offset_by_interval': slope and asdict(slope),
         'offset_by_jitter': jitter and asdict(jitter),

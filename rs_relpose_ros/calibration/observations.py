@@ -21,7 +21,7 @@ from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import readout_direction, RollingShutterCamera
 from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
@@ -354,6 +354,13 @@ class Observations:
             noise_density(gyro_times, gyro.rates),
         )
 
+    def along(self, axis: int) -> Observations:
+        """The same with rows along the pixel coordinate `axis`, 0 or 1."""
+        if axis == self.camera.readout_axis:
+            return self
+        camera = replace(self.camera, readout_direction=readout_direction(axis, 1.0))
+        return replace(self, camera=camera)
+
     @property
     def interval(self) -> float:
         """Median interval between frames [s]."""
@@ -383,7 +390,13 @@ class Observations:
     def selected_problem(
         self, selection: PairSelection, offset: float, rng: np.random.Generator
     ) -> model.Problem:
-        """Data of a fit to pairs all of whose rows lie within the gyro and touch no gap of it.
+        """Data of a fit to the pairs of `selected_pairs`."""
+        return self.problem(self.selected_pairs(selection, offset, rng), offset)
+
+    def selected_pairs(
+        self, selection: PairSelection, offset: float, rng: np.random.Generator
+    ) -> list[Pair]:
+        """Pairs all of whose rows lie within the gyro and touch no gap of it.
 
         `offset` [s] is about that of the clocks. InputError if there are fewer than ten pairs.
         """
@@ -402,7 +415,7 @@ class Observations:
         most = min(selection.most_pairs, round(_PAIRS_PER_SECOND * self.times[-1]))
         if len(pairs) > most:
             pairs = [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, most)]
-        return self.problem(pairs, offset)
+        return pairs
 
     def image_rates(self, pairs: Sequence[Pair]) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame, that rotates the rays of each pair."""
@@ -444,7 +457,8 @@ class Observations:
         information = np.zeros(model.GLOBAL)
         information[model.BIAS] = _BIAS_SIGMA**-2
         information[model.SLOPE] = _SLOPE_SIGMA**-2
-        information[model.CENTER] = (_CENTER_SIGMA * self.camera.width) ** -2
+        longer_side = max(self.camera.width, self.camera.height)
+        information[model.CENTER] = (_CENTER_SIGMA * longer_side) ** -2
         if self.exposure.square_sigma:
             information[model.EXPOSURE] = self.exposure.square_sigma**-2
         whole = np.diag(information)

@@ -18,10 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.core.deviations import (
     by_stamped_row,
+    COMMON,
+    FIRST,
     LENS,
     LIVE,
     N_DEVIATIONS,
-    PARTS,
+    Selection,
 )
 from rs_relpose_ros.core.epipolar import derivatives
 from rs_relpose_ros.core.least_squares import inverse
@@ -48,10 +50,10 @@ from rs_relpose_ros.imu.integration import ImuSlice
 _VELOCITY_SIGMA = 1.0
 # Residuals of this many sigmas have half the weight of small ones (Cauchy). Fewer lose
 # information, more let wrong matches count. [derived: 95 % efficiency for normal residuals]
-_CAUCHY_SIGMAS = 2.4
+CAUCHY_SIGMAS = 2.4
 # Least noise of matches [px]. It limits the information of matches without noise.
 # [chosen: below the noise of any tracker]
-_LEAST_SIGMA = 0.05
+LEAST_SIGMA = 0.05
 # Least noise of the gyro's rotation between two frames [rad]; without it a gyro that is configured
 # as free of noise has no finite information. [chosen: below that of any gyro]
 _LEAST_ROTATION_SIGMA = 1e-5
@@ -67,14 +69,17 @@ _UNKNOWN_VELOCITY = 30.0
 # Steps of a new fit of a pair, which starts near its optimum. Fewer would leave it off, more cost
 # time. [chosen: Gauss-Newton is quadratic; 3 to 5 would do]
 _NEW_STEPS = 3
+# Deviations of which the pose has a doubt: the principal point is not estimated, since axes of the
+# IMU have nearly the same effect.
+_DOUBTED = Selection.of(*LIVE.parts, 'principal_point', gyro_scale=COMMON, distortion=FIRST)
 # Places of single deviations in the vector c: of the time offset of the stamped row,
 _OFFSET = LIVE.index('time_offset')
 # of the readout time,
 _READOUT = LIVE.index('readout_time')
+# and of the first coefficient of the distortion.
+_DISTORTION = LIVE.index('distortion')
 # Number of deviations before those of the lens, which come last.
-_LENS = LIVE.part('focal_log').start
-# Deviations that leave a pattern in the image: the entries of the lens.
-OF_LENS = tuple(name for name in LIVE.parts if LENS.start <= PARTS[name].start < LENS.stop)
+_LENS = LIVE.index('focal_log')
 # Of a state: rotation and direction of translation.
 _POSE = np.r_[THETA : THETA + 3, TANGENT : TANGENT + 2]
 
@@ -102,9 +107,9 @@ class PairInformation:
 
     S: Array  # (K, K)
     b: Array  # (K,)
-    # (K,) factors of both if a deviation is free: its residuals are no noise.
-    if_free: Array
+    if_distorted: float  # factor of both if the distortion is free: its residuals are no noise
     pose_by_deviation: Array  # (6, K) of (dt, dtheta) in camera 1, first order
+    pose_by_center: Array  # (6, 2) the same by the principal point [px]
     # (5, K) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
     images_against_gyro: Array  # (3,) [rad] Log of the rotation by images alone and R_gyro^T
@@ -113,7 +118,7 @@ class PairInformation:
 
 
 class _Linearised(NamedTuple):
-    """A pair at its fitted state: residuals, and derivatives by the state and K deviations.
+    """A pair at its fitted state: residuals, and derivatives by the state and C deviations.
 
     The matches depend on both. The rotation by the gyro is a prior of the state, and the gyro
     depends on the deviations: ``theta = Log(R R_gyro^T)`` becomes smaller by ``gyro dc``.
@@ -123,12 +128,10 @@ class _Linearised(NamedTuple):
     observations: Array  # (N, 20) rows of `sampson`
     residuals: Array  # (N,) [px]
     by_state: Array  # (N, 17)
-    by_deviation: Array  # (N, K)
-    by_image: Array  # (N, 9) by the deviations of IMAGES
+    by_deviation: Array  # (N, C)
     prior: priors.Priors  # of the state
     theta: Array  # (3,)
-    gyro: Array  # (3, K) rotation of R_gyro, on its left
-    gyro_by_image: Array  # (3, 9) the same
+    gyro: Array  # (3, C) rotation of R_gyro, on its left
 
 
 class _Normal(NamedTuple):
@@ -136,9 +139,9 @@ class _Normal(NamedTuple):
 
     H: Array  # (17, 17)
     gradient: Array  # (17,)
-    mixed: Array  # (17, K)
-    own: Array  # (K, K)
-    own_gradient: Array  # (K,)
+    mixed: Array  # (17, C)
+    own: Array  # (C, C)
+    own_gradient: Array  # (C,)
 
 
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
@@ -148,30 +151,25 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     are too few matches, or if a fit far from the gyro's rotation diverges.
     """
     at = about - active
-    step = math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
-    pair = replace(
-        pair,
-        camera=_with_lens(pair.camera, tuple(at[_LENS:])),
-        points1=pair.points1[::step],
-        points2=pair.points2[::step],
-    )
+    pair = thinned(pair, at)
     problem = problem_of(pair)
     information = problem.rotation_information
     if np.count_nonzero(problem.valid) < PARAMETERS or information is None:
         return None
     linear = _linearised(pair, problem, at)
-    sigma = robust_scale(linear.residuals, _LEAST_SIGMA, 0.0)
-    weights = cauchy_weight((linear.residuals / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
+    sigma = robust_scale(linear.residuals, LEAST_SIGMA, 0.0)
+    weights = cauchy_weight((linear.residuals / (CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     normal = _normal_equations(linear, weights, information)
     solved = inverse(normal.H) @ np.column_stack([normal.mixed, normal.gradient])
     if not np.isfinite(solved).all():
         return None
-    S = normal.own - normal.mixed.T @ solved[:, :-1]
+    estimated = slice(0, LIVE.size)
+    S = (normal.own - normal.mixed.T @ solved[:, :-1])[estimated, estimated]
     S = 0.5 * (S + S.T)
-    b = normal.mixed.T @ solved[:, -1] - normal.own_gradient
-    ratio, if_free = _common_noise(
+    b = (normal.mixed.T @ solved[:, -1] - normal.own_gradient)[estimated]
+    ratio, if_distorted = _common_noise(
         FitMatches(linear.observations, weights, 1.0),
-        linear.by_deviation - linear.by_state @ solved[:, :-1],
+        (linear.by_deviation - linear.by_state @ solved[:, :-1])[:, estimated],
         linear.residuals - linear.by_state @ solved[:, -1],
         S,
     )
@@ -180,13 +178,23 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     return PairInformation(
         S,
         b + S @ about,
-        ratio / if_free,
-        by_deviation,
-        whitened,
+        ratio / if_distorted,
+        by_deviation[:, estimated],
+        by_deviation[:, LIVE.size :],
+        whitened[:, estimated],
         _images_against_gyro(linear, normal, information),
-        _images_by_deviation(
-            linear, weights, normal, information, bool(np.isfinite(pair.t).all())
-        ),
+        _images_by_deviation(linear, normal, information, bool(np.isfinite(pair.t).all())),
+    )
+
+
+def thinned(pair: PairData, at: Array) -> PairData:
+    """The pair with at most `_MOST_MATCHES` matches, through the lens of the deviations `at`."""
+    step = math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
+    return replace(
+        pair,
+        camera=_lens(pair.camera, *at[_LENS:]),
+        points1=pair.points1[::step],
+        points2=pair.points2[::step],
     )
 
 
@@ -201,6 +209,27 @@ def problem_of(pair: PairData) -> TwoViewProblem:
         pair.segment.rotation,
         pair.segment.noise_covariance + _LEAST_ROTATION_SIGMA**2 * np.eye(3),
     )
+
+
+class Misfit(NamedTuple):
+    """How badly a fitted pair agrees with a camera and deviations."""
+
+    residuals: Array  # (N,) [px]
+    of_gyro: float  # half the squared Mahalanobis distance from the gyro's rotation
+
+
+def misfit_of(pair: PairData, at: Array) -> Misfit | None:
+    """Misfit of a pair that is fitted again at deviations `at` (K,) from the active ones.
+
+    None if there are too few matches.
+    """
+    pair = replace(thinned(pair, at), R=pair.segment.rotation, t=np.full(3, np.nan))
+    problem = problem_of(pair)
+    information = problem.rotation_information
+    if np.count_nonzero(problem.valid) < PARAMETERS or information is None:
+        return None
+    linear = _linearised(pair, problem, at)
+    return Misfit(linear.residuals, 0.5 * float(linear.theta @ information @ linear.theta))
 
 
 class FrameRows(NamedTuple):
@@ -239,9 +268,7 @@ def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -
 
 def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearised:
     """The pair fitted at deviations `at` (K,) from the active ones, and linearised there."""
-    share = middle_share(pair.camera)
-    basis = by_stamped_row(LIVE, share) * LIVE.scales(pair.camera.width)
-    of_images = by_stamped_row(IMAGES, share)
+    basis = by_stamped_row(_DOUBTED, middle_share(pair.camera))
     turning = basis[:, :_LENS] @ at[:_LENS]  # the lens is in the camera already
     frames = [frame_rows(pair, problem, image, turning) for image in (0, 1)]
     observations = np.column_stack(
@@ -268,11 +295,9 @@ def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearis
         residuals,
         jacobian(observations, state),
         by_deviation @ basis,
-        by_deviation @ of_images,
         prior,
         so3.log_so3(np.ascontiguousarray(state.R @ rotation.T)),
         gyro @ basis,
-        gyro @ of_images,
     )
 
 
@@ -305,8 +330,10 @@ def residuals_by_deviation(state: TwoViewState, frames: list[FrameRows]) -> tupl
 
 def _gyro(pair: PairData) -> Array:
     """Rotation (3, D) of the gyro's rotation between the middle rows by all deviations."""
-    path = pair.segment.path
-    return row_states(path, pair.R_cam_imu, path.times[-1:], np.zeros(1)).by_deviation[0]
+    segment = pair.segment
+    times = (segment.stamps_ns - segment.stamps_ns[0]) * 1e-9
+    path = GyroPath.integrated(times, np.ascontiguousarray(segment.angular_velocities))
+    return row_states(path, pair.R_cam_imu, times[-1:], np.zeros(1)).by_deviation[0]
 
 
 def _normal_equations(linear: _Linearised, weights: Array, information: Array) -> _Normal:
@@ -337,7 +364,7 @@ def _images_against_gyro(linear: _Linearised, normal: _Normal, information: Arra
 
 
 def _images_by_deviation(
-    linear: _Linearised, weights: Array, normal: _Normal, information: Array, has_direction: bool
+    linear: _Linearised, normal: _Normal, information: Array, has_direction: bool
 ) -> Array:
     """Change of pose and velocities by the images alone (11, 9) with the deviations of IMAGES.
 
@@ -347,23 +374,26 @@ def _images_by_deviation(
     of_theta = slice(THETA, THETA + 3)
     of_priors, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     priors.add_priors(linear.state, linear.prior, of_priors, gradient)
-    H = normal.H - of_priors
+    H, mixed = normal.H - of_priors, normal.mixed.copy()
     H[POSE:, POSE:] += linear.prior.rate_weight * np.eye(PARAMETERS - POSE)
-    mixed = (linear.by_state.T * weights) @ linear.by_image
-    moved = np.zeros((POSE, IMAGES.size))
+    mixed[of_theta] += information @ linear.gyro
+    moved = np.zeros((POSE, mixed.shape[1]))
     if has_direction:
         velocities = slice(TANGENT + 2, POSE)
         H[velocities, velocities] += _UNKNOWN_VELOCITY**-2 * np.eye(6)
         moved[:] = -(inverse(H) @ mixed)[:POSE]
     else:
         moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], mixed[of_theta])
-    return moved
+    by_deviation = np.empty((POSE, IMAGES.size))
+    for name, columns in IMAGES.parts.items():
+        by_deviation[:, columns] = moved[:, _DOUBTED.part(name)]
+    return by_deviation
 
 
 def _shifts(
     pair: PairData, problem: TwoViewProblem, linear: _Linearised, normal: _Normal
 ) -> tuple[Array, Array]:
-    """Shift of the estimated pose by the deviations, (6, K), and whitened, (5, K).
+    """Shift of the estimated pose by C deviations, (6, C), and whitened, (5, C).
 
     With the prior of the estimate for the gyro's rotation. The state is that at the middle row,
     which a longer readout time delays by D = share c against the stamped row:
@@ -390,17 +420,22 @@ def _shifts(
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
-def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, Array]:
+def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, float]:
     """Variance of the score of the matches by image regions, over that by S; at least 1.
 
-    The second one (K,) is without the residuals that a deviation of the lens explains, for each
-    deviation: its pattern in the image is no noise if the deviation is free. J (N, K), r (N,):
+    The second value is without residuals that a distortion explains. J (N, K), r (N,):
     derivatives and residuals of the fitted matches, S (K, K): information of the pair.
     """
     scale = np.outer(LIVE.sigmas, LIVE.sigmas)
     covariance = inverse(S * scale + np.eye(LIVE.size)) * scale
     in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
+    along = J[:, _DISTORTION]
     information = J.T * matches.weights @ J
+    without = r - along * (
+        (along * matches.weights)
+        @ r
+        / (np.diag(information)[_DISTORTION] + LIVE.sigmas[_DISTORTION] ** -2.0)
+    )
     independent = float((covariance * information).sum())
 
     def ratio(left: Array) -> float:
@@ -408,14 +443,7 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
         return max((1.0 + float(((sums @ covariance) * sums).sum())) / (1.0 + independent), 1.0)
 
     by_regions = ratio(r)
-    if_free = np.full(LIVE.size, by_regions)
-    for name in OF_LENS:
-        part = LIVE.part(name)
-        along = J[:, part]
-        own = information[part, part] + np.diag(LIVE.sigmas[part] ** -2.0)
-        explained = along @ np.linalg.solve(own, (along.T * matches.weights) @ r)
-        if_free[part] = min(ratio(r - explained), by_regions)
-    return by_regions, if_free
+    return by_regions, min(ratio(without), by_regions)
 
 
 def _state(
@@ -435,18 +463,17 @@ def _state(
         return state
     r = np.abs(residuals(observations, state))
     matches = FitMatches(
-        observations, (r < 4.0 * np.median(r)).astype(float), robust_scale(r, _LEAST_SIGMA, 0.0)
+        observations, (r < 4.0 * np.median(r)).astype(float), robust_scale(r, LEAST_SIGMA, 0.0)
     )
     return gauss_newton(matches, state, prior, _NEW_STEPS)
 
 
 @functools.lru_cache(maxsize=16)
-def _with_lens(camera: RollingShutterCamera, lens: tuple[float, ...]) -> RollingShutterCamera:
-    """The camera with deviations of its lens, the last ones of `LIVE`."""
-    if not any(lens):
+def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
+    """The camera with deviations of focal length and distortion."""
+    if not (focal or distortion):
         return camera
-    basis = LIVE.basis[LENS, _LENS:] * LIVE.scales(camera.width)[_LENS:]
-    return camera.moved_lens(basis @ lens)
+    return camera.moved_lens(LIVE.basis[LENS, _LENS:] @ (focal, distortion))
 
 
 def middle_share(camera: RollingShutterCamera) -> float:
@@ -538,7 +565,7 @@ class Calibration:
     covariance: Array  # (K, K)
     S: Array  # (N, K, K) and (N, K): of the pairs, without a prior
     b: Array
-    if_free: Array  # (N, K) factors of these if a deviation is free
+    if_distorted: Array  # (N,) factors of these
     about: Array  # (K,) about which they are linearised, in the mean by their information
     scatter: float  # variance of the scores over that by S: 1 where residuals are independent
     shared: float  # factor of the variances by errors that are common to all pairs
@@ -556,7 +583,7 @@ NOTHING_ESTIMATED = Calibration(
     np.diag(LIVE.sigmas**2),
     np.zeros((0, LIVE.size, LIVE.size)),
     np.zeros((0, LIVE.size)),
-    np.zeros((0, LIVE.size)),
+    np.zeros(0),
     np.zeros(LIVE.size),
     1.0,
     1.0,
@@ -635,9 +662,9 @@ class Posterior:
         n = len(self._pairs)
         if not n:
             return NOTHING_ESTIMATED
-        S, b, if_free = (
+        S, b, if_distorted = (
             np.array([getattr(pair.information, name) for pair in self._pairs])
-            for name in ('S', 'b', 'if_free')
+            for name in ('S', 'b', 'if_distorted')
         )
         # Scaled by the prior: the deviations have different units.
         scale = LIVE.sigmas
@@ -658,7 +685,7 @@ class Posterior:
             shared * covariance * np.sqrt(np.outer(ratios, ratios)),
             S,
             b,
-            if_free,
+            if_distorted,
             about,
             float(np.median(ratios)),
             shared,

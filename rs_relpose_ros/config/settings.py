@@ -42,7 +42,6 @@ class Declared:
     live: bool = False  # a running node may change it
     restarts: bool = False  # it may, and begins again with the new value
     kind: type = float
-    deviation: str = ''  # name in `core.deviations` of the deviation whose sigma this is
 
     @property
     def legal(self) -> str:
@@ -245,7 +244,6 @@ class ImuConfig(Settings):
         low=0.0,
         high=1.0,
         restarts=True,
-        deviation='gyro_bias',
     )
     accel_noise_density: float = setting(
         3e-3, 'white noise of the accelerometer', 'm/s^2/sqrt(Hz)', low=1e-6, high=10.0
@@ -556,16 +554,10 @@ def pinhole_of_matrix(name: str, k: Sequence[float]) -> dict[str, Any]:
     return {'fx': fx, 'fy': fy, 'cx': cx, 'cy': cy}
 
 
-def _sigma(of: str, unit: str, high: float, per: str = '', *, deviation: str = '') -> Any:
-    """Sigma of a calibrated parameter, which is the sigma of a `deviation`."""
+def _sigma(of: str, unit: str, high: float, per: str = '') -> Any:
+    """Sigma of a calibrated parameter."""
     return setting(
-        0.0,
-        f'{of}, 1 sigma{per}; 0 if it is not known',
-        unit,
-        low=0.0,
-        high=high,
-        restarts=True,
-        deviation=deviation,
+        0.0, f'{of}, 1 sigma{per}; 0 if it is not known', unit, low=0.0, high=high, restarts=True
     )
 
 
@@ -594,18 +586,12 @@ class IntrinsicsConfig(Settings):
         kind=tuple,
         restarts=True,
     )
-    focal_length_sigma: float = _sigma(
-        'relative uncertainty of the focal length', '', 1.0, deviation='focal_log'
-    )
+    focal_length_sigma: float = _sigma('relative uncertainty of the focal length', '', 1.0)
     distortion_sigma: float = _sigma(
-        'uncertainty of the first of distortion_coefficients', '', 10.0, deviation='distortion'
+        'uncertainty of the first of distortion_coefficients', '', 10.0
     )
     principal_point_sigma: float = _sigma(
-        'uncertainty of the principal point',
-        'px',
-        1e4,
-        ' per axis',
-        deviation='principal_point',
+        'uncertainty of the principal point', 'px', 1e4, ' per axis'
     )
 
     def __post_init__(self) -> None:
@@ -654,9 +640,7 @@ class SensorConfig(Settings):
         kind=float,
         restarts=True,
     )
-    readout_time_sigma: float = _sigma(
-        'uncertainty of readout_time', 's', 1.0, deviation='readout_time'
-    )
+    readout_time_sigma: float = _sigma('uncertainty of readout_time', 's', 1.0)
     readout_direction: str = setting(
         'down',
         'whether row 0 is read first (down) or last (up); for images turned by 90 deg, whose '
@@ -705,9 +689,7 @@ class SensorConfig(Settings):
         high=10.0,
         restarts=True,
     )
-    time_offset_sigma: float = _sigma(
-        'uncertainty of time_offset', 's', 10.0, deviation='time_offset'
-    )
+    time_offset_sigma: float = _sigma('uncertainty of time_offset', 's', 10.0)
     time_offset_per_interval: float = setting(
         0.0,
         'change of time_offset with the interval T between frames (automatic exposure): '
@@ -748,9 +730,7 @@ class SensorConfig(Settings):
         kind=tuple,
         restarts=True,
     )
-    axes_sigma: float = _sigma(
-        'uncertainty of quat_cam_imu_xyzw', 'rad', 1.0, ' per axis', deviation='axes'
-    )
+    axes_sigma: float = _sigma('uncertainty of quat_cam_imu_xyzw', 'rad', 1.0, ' per axis')
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -904,15 +884,6 @@ class Parameters:
         for group in dataclasses.fields(Parameters):
             for item in dataclasses.fields(group.default_factory):  # type: ignore[arg-type]
                 yield item.name, item.default, declared(item)
-
-    def deviation_sigmas(self) -> dict[str, float]:
-        """Configured sigmas by the names of their deviations; 0 where they are not known."""
-        return {
-            declared(item).deviation: getattr(group, item.name)
-            for group in (self.sensor, self.imu, self.intrinsics)
-            for item in dataclasses.fields(group)
-            if declared(item).deviation
-        }
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Parameters:

@@ -105,12 +105,16 @@ class Doubts:
 
 def _configured_sigmas(parameters: Parameters) -> Array:
     """Sigmas of the deviations of IMAGES; 0 for one that is taken as exact."""
-    configured = parameters.deviation_sigmas()
+    sensor, lens = parameters.sensor, parameters.intrinsics
     # A parameter that relpose_node tracks is not constant: its deviation is no unknown.
-    if parameters.sensor.track_time_offset:
-        configured['time_offset'] = 0.0
-    if parameters.sensor.track_readout_time:
-        configured['readout_time'] = 0.0
+    configured = {
+        'axes': sensor.axes_sigma,
+        'time_offset': 0.0 if sensor.track_time_offset else sensor.time_offset_sigma,
+        'readout_time': 0.0 if sensor.track_readout_time else sensor.readout_time_sigma,
+        'focal_log': lens.focal_length_sigma,
+        'distortion': lens.distortion_sigma,
+        'principal_point': lens.principal_point_sigma,
+    }
     sigmas = np.zeros(IMAGES.size)
     for name, columns in IMAGES.parts.items():
         sigmas[columns] = configured[name]

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
-from rs_relpose_ros.calibration.assessment import Effect, Inconsistency
-from rs_relpose_ros.calibration.findings import Assessment, Configured, Finding
+from rs_relpose_ros.calibration.assessment import Configured, Effect, Inconsistency
+from rs_relpose_ros.calibration.findings import Assessment, Finding
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
+from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
@@ -28,6 +30,16 @@ _ARRIVALS, _EFFECTS = 20, 30
 _REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
 
 
+class _Due(NamedTuple):
+    """A pair that was added and is not assessed yet."""
+
+    stamp_ns: int
+    data: posterior.PairData | None
+    pose: RelativePose
+    configured: Configured
+    information: posterior.PairInformation | None = None
+
+
 class ConsistencyMonitor:
     """Compares the configuration with frames and pairs in the order of time.
 
@@ -37,6 +49,7 @@ class ConsistencyMonitor:
     def __init__(self) -> None:
         self.rotations = RotationSums()
         self._recursion = Posterior()
+        self._directions = ReadoutDirections()
         self.acceleration = AccelerationSums()
         self.agreement = Agreement()
         self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
@@ -51,7 +64,7 @@ class ConsistencyMonitor:
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
         # The last pair until it is assessed.
-        self._due: tuple[posterior.PairInformation | None, RelativePose, Configured] | None = None
+        self._due: _Due | None = None
         self.health, self.calibration = findings.NOT_EVALUATED, posterior.NOTHING_ESTIMATED
 
     def add_acceleration(self, stamp_ns: int, evidence: InertialEvidence) -> None:
@@ -71,7 +84,7 @@ class ConsistencyMonitor:
 
         `data` is None if the pair has no rotation or no gyro. `assess` completes it.
         """
-        self.latest, self._due = None, (None, pose, configured)
+        self.latest, self._due = None, _Due(stamp_ns, data, pose, configured)
         if data is None:
             return pose
         try:
@@ -85,22 +98,23 @@ class ConsistencyMonitor:
             )
             if information is None:
                 return pose
-            self._due = information, pose, configured
+            self._due = self._due._replace(information=information)
             self.calibration = self._recursion.solved()
-            if pose.by_deviation is not None:
-                # The published pose is the one of all frames, which depends less on deviations.
-                information = replace(information, pose_by_deviation=pose.by_deviation)
-                self.latest, self._due = information, (information, pose, configured)
             by_deviation = information.pose_by_deviation
             shift = by_deviation @ self._deviation()
+            by_center = configured.center_sigma * information.pose_by_center
             if self._undetermined is None:
                 self._undetermined = assessment.undetermined(self.calibration, configured)
         except np.linalg.LinAlgError:
             # A pair without rank has no information on the calibration; its pose is kept.
             self._inconsistent = []
             return pose
-        # The inconsistency, and deviations that the pairs so far have not excluded.
-        doubt = np.outer(shift, shift) + by_deviation @ self._undetermined @ by_deviation.T
+        # The inconsistency, deviations that the pairs so far have not excluded, and the center.
+        doubt = (
+            np.outer(shift, shift)
+            + by_center @ by_center.T
+            + (by_deviation @ self._undetermined @ by_deviation.T)
+        )
         images = pose.images and pose.images.moved_by(information.images_by_deviation)
         widened = replace(pose, covariance=pose.covariance + doubt, images=images)
         # The effect of an inconsistent parameter on the baseline is not known.
@@ -116,7 +130,8 @@ class ConsistencyMonitor:
         """Assess all quantities after the last pair, for the next one: its pose does not wait."""
         if self._due is None:
             return
-        (information, pose, configured), self._due = self._due, None
+        due, self._due = self._due, None
+        information, pose, configured = due.information, due.pose, due.configured
         if information is not None:
             try:
                 if self._recursion.relinearise():
@@ -134,14 +149,14 @@ class ConsistencyMonitor:
             except np.linalg.LinAlgError:
                 self._inconsistent = []
             self._undetermined = assessment.undetermined(self.calibration, configured)
+            self._compare_directions(due)
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
         ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
         self._gross = assessment.gross_errors(
             self.rotations.compared(), ahead, configured, self._gross
         )
-        self.health = assessment.assess(
-            self.calibration, self._inconsistent, self._gross, configured
-        )
+        gross = self._gross or self._directions.findings(configured.camera)
+        self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
         self._wrong_configuration = bool(self.health.faults)
         if self._wrong_configuration:
             self.acceleration.clear()
@@ -152,6 +167,13 @@ class ConsistencyMonitor:
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
+
+    def _compare_directions(self, due: _Due) -> None:
+        """Compare other directions of the readout while the configuration is inconsistent."""
+        if self._inconsistent and due.data is not None:
+            self._directions.add(due.stamp_ns, due.data, self._deviation())
+        else:
+            self._directions.clear()
 
     def _deviation(self) -> Array:
         """(K,) from the active values, of all inconsistent quantities."""
