@@ -24,7 +24,7 @@ from rs_relpose_ros.bags.files import naming_damage, open_files
 from rs_relpose_ros.bags.order import reading_times
 from rs_relpose_ros.bags.storage import Entry, message_data, StoredTopic
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 # The bags that the project writes have their images on this topic. [derived: interface]
 COMPRESSED_TOPIC = '/camera/image_raw/compressed'
@@ -309,6 +309,8 @@ class Bag:
         self._files, self._storages, metadata = open_files(path, stack)
         # Gets the topic of each message that is read, for a progress bar.
         self.on_message: Callable[[str], object] = lambda topic: None
+        # The clock of the IMU less that of the camera [s], for the order of reading by stamps.
+        self.time_offset = 0.0
         # A topic may have messages in several files.
         self._stored: dict[tuple[str, str], StoredTopic] = {}
         for opened in self._storages:
@@ -457,7 +459,12 @@ class Bag:
         numbers = self._numbers.items()
         sensors = [number for (_, msgtype), number in numbers if msgtype in _MEASURED]
         of_info = [number for (_, msgtype), number in numbers if msgtype == CAMERA_INFO]
-        times = reading_times(index.stamp, index.topic, sensors)
+        of_camera = [n for (_, msgtype), n in numbers if msgtype in (*_IMAGES, CAMERA_INFO)]
+        stamps = index.stamp
+        if abs(self.time_offset) > _LEAST_OFFSET:
+            shift_ns = to_nanoseconds(self.time_offset)
+            stamps = stamps + shift_ns * np.isin(index.topic, of_camera)
+        times = reading_times(stamps, index.topic, sensors)
         infos = np.flatnonzero(np.isin(index.topic, of_info))
         if len(infos):
             # It serves the images before it, too: drivers publish it late, or once.
@@ -519,7 +526,11 @@ class Bag:
 
 
 # Types of the sensors whose clocks decide the order of reading. [derived: `reading_times`]
-_MEASURED = (IMAGE, COMPRESSED_IMAGE, IMU)
+_IMAGES = (IMAGE, COMPRESSED_IMAGE)
+_MEASURED = (*_IMAGES, IMU)
+# Smallest offset of the clocks [s] that changes the order of reading: within less the history of
+# the IMU has the samples of an image anyhow. [chosen: below its 5 s, above delays of drivers]
+_LEAST_OFFSET = 1.0
 # Bytes before the stamp of a message with a header: they name the encoding, or hold a number in
 # ROS 1. [derived: CDR, and std_msgs/Header of ROS 1]
 _BEFORE_STAMP = 4

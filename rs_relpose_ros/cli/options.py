@@ -176,6 +176,7 @@ def opened(
         topics = bag.find_topics(
             topic_options(args), needs_camera_info=not parameters.intrinsics.given
         )
+        bag.time_offset = parameters.sensor.time_offset
         parameters, contradiction = with_extrinsics(bag, topics, parameters)
         if contradiction:
             _logger.warning('%s', contradiction)

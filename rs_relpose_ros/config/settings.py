@@ -685,8 +685,8 @@ class SensorConfig(Settings):
         0.0,
         'IMU clock minus camera clock: t_imu = stamp + time_offset',
         's',
-        low=-10.0,
-        high=10.0,
+        low=-1e5,
+        high=1e5,
         restarts=True,
     )
     time_offset_sigma: float = _sigma('uncertainty of time_offset', 's', 10.0)

@@ -60,6 +60,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     """
     images = chosen.image.count if chosen.image else 0
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
+    bag.time_offset = parameters.sensor.time_offset
     scan = Scan(images, parameters.intrinsics)
     completion, sample, topics = Completion(parameters), None, None
     source = scan.added(sensor_messages(bag, chosen, faulty=True))
@@ -78,7 +79,11 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
                     found=check_recording.calibrated(bag, topics, completion.parameters)
                 )
         faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
-        findings += joint_findings(scan, sample, completion, parameters, faults)
+        offset = None
+        doubtful = sample is not None and (not sample.poses or sample.health.state is WRONG)
+        if doubtful and not faults:
+            offset = _offset_of_clocks(bag, topics, scan, completion.parameters)
+        findings += joint_findings(scan, sample, completion, parameters, faults, offset)
     return CheckReport(str(bag.path), with_parents(findings))
 
 
@@ -619,7 +624,7 @@ def _accelerometer(scan: Scan) -> Line:
 # [chosen: 0.2 to 1 s would do]
 _SAME_CLOCK = 0.5
 # Largest legal value of the parameter time_offset [s]. [derived: its declaration]
-_LARGEST_OFFSET = 10.0
+_LARGEST_OFFSET = 1e5
 # Matches of a pair in the median below which there is no estimate, and below which they are few.
 # [chosen: a solver samples 9 or 11 matches, and an inlier ratio is never 1]
 _NO_MATCHES = 15
@@ -650,23 +655,28 @@ def joint_findings(
     completion: Completion,
     parameters: Parameters,
     faults: Mapping[Kind, StreamFault],
+    offset: float | None = None,
 ) -> list[Line]:
     """Findings on both sensors together.
 
-    `sample` is None if `completion` could not find missing `parameters`.
+    `sample` is None if `completion` could not find missing `parameters`. `offset` [s]: time offset
+    with which clocks that differ have poses.
     """
-    health = Assessment(()) if sample is None else _with_calibration(sample, scan, completion)
+    health = Assessment(())
+    if sample is not None and offset is None:
+        health = _with_calibration(sample, scan, completion)
     has_poses = sample is not None and sample.poses > 0 and health.state is not WRONG
-    found = [_overlap(scan, parameters, has_poses)]
+    found = [_overlap(scan, parameters, has_poses, offset)]
     if Kind.SINCE_BOOT in faults:
         found = [_of_fault(Code.CLOCKS, WRONG, faults[Kind.SINCE_BOOT])]
     cause = next((fault for fault in faults.values() if fault.withholds), None)
-    if sample is not None and cause is not None:
-        message = f'not measured: {cause.message}'
-        found.append(property_line(Code.PAIRS, UNKNOWN, message, '', {}))
+    why = 'the clocks differ' if offset is not None else cause and cause.message
+    if sample is not None and why:
+        found.append(property_line(Code.PAIRS, UNKNOWN, f'not measured: {why}', '', {}))
     elif sample is not None:
         found += [_pairs(sample, health), _texture(sample, health)]
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
+    reason = reason if offset is None else 'the clocks differ'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
     found += [_not_configured(code, completion, scan) for code in sorted(missing)]
     found += [line for line in quantity_findings(health, reason) if line.code not in missing]
@@ -674,7 +684,22 @@ def joint_findings(
     return found if effect is None else [*found, effect]
 
 
-def _overlap(scan: Scan, parameters: Parameters, has_poses: bool) -> Line:
+def _offset_of_clocks(
+    bag: Bag, topics: SensorTopics, scan: Scan, parameters: Parameters
+) -> float | None:
+    """Time offset [s] of clocks that differ by more than drivers do, tried with the front end."""
+    apart = scan.stamps(Role.IMAGE).delay - scan.stamps(Role.IMU).delay
+    # NaN where a sensor has no stamps
+    if not _SAME_CLOCK < abs(apart + parameters.sensor.time_offset) <= _LARGEST_OFFSET:
+        return None
+    with suppress(InputError):  # the recording permits no calibration
+        return check_recording.found_offset(bag, topics, parameters, apart)
+    return None
+
+
+def _overlap(
+    scan: Scan, parameters: Parameters, has_poses: bool, offset: float | None = None
+) -> Line:
     """Whether the gyro covers the images in time, as stamped.
 
     If there are poses the stamps are right, and a difference of the delays is that of delivery.
@@ -688,11 +713,14 @@ def _overlap(scan: Scan, parameters: Parameters, has_poses: bool) -> Line:
     measured = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
     apart_too_far = max(_SAME_CLOCK, 0.5 * images.duration)
     is_apart = abs(apart + parameters.sensor.time_offset) > apart_too_far
-    if common <= 0.0 or (is_apart and not has_poses):
+    if common <= 0.0 or (is_apart and not has_poses) or offset is not None:
         fix = 'use one clock for both drivers (ROS time, not time since boot)'
-        if abs(apart) <= _LARGEST_OFFSET:
-            fix += f', or set time_offset: {apart:.3f} if the difference is constant'
         message = f'images and IMU are stamped {abs(apart):.3f} s apart'
+        if offset is not None:
+            side = 'ahead of' if offset > 0.0 else 'behind'
+            message = f"the clock of the IMU is {abs(offset):.3f} s {side} the images'"
+            fix += f', or set time_offset: {offset:.3f} if the difference is constant (tried)'
+            measured['time_offset_s'] = offset
         return property_line(name, WRONG, message, fix, measured)
     history = parameters.imu.imu_buffer_seconds
     return by_case(

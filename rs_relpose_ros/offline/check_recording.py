@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
-from rs_relpose_ros.calibrate.procedure import read_recording
+from rs_relpose_ros.calibrate.procedure import read_recording, Recorder
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.findings import (
@@ -37,7 +37,14 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuBuffer
 from rs_relpose_ros.imu.filters import GyroBias
 from rs_relpose_ros.messages.camera_info import intrinsics_from_info
-from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import (
+    Intake,
+    PARTS,
+    ReasonCounts,
+    Role,
+    sensor_messages,
+    stamp_ns,
+)
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
@@ -214,7 +221,7 @@ class Completion(NamedTuple):
 def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
     """Calibration without initial values, of images in the middle of the recording."""
     tracking, images = parameters.tracking, topics.image.count
-    first = max(images - _CALIBRATED_IMAGES, 0) // 2
+    first = _first_of_middle(topics)
     recording = read_recording(
         bag,
         topics,
@@ -333,6 +340,49 @@ def _contradiction(
         BY_CODE[code].unit,
         settings={code.value: estimated} if settings is None else settings,
     )
+
+
+# A suggested time offset is rounded to so many digits [s]. [chosen: the clocks of drivers agree
+# to a millisecond; four would be as good]
+_OFFSET_DIGITS = 3
+
+
+def found_offset(
+    bag: Bag, topics: SensorTopics, parameters: Parameters, apart: float
+) -> float | None:
+    """Time offset [s] near `apart` by the rotation of images and gyro, if poses come with it.
+
+    None if the recording does not determine it, or if no pair has a pose with it.
+    """
+    recorder, first = Recorder(parameters.tracking), _first_of_middle(topics)
+    number = 0
+    for role, message in sensor_messages(bag, topics, faulty=True):
+        of_middle = first <= number < first + _CALIBRATED_IMAGES
+        if role in (Role.IMU, Role.CAMERA_INFO) or (role is Role.IMAGE and of_middle):
+            recorder.add(role, message.message)
+        number += role is Role.IMAGE
+    recording = recorder.recording()
+    gyro, shift_ns = recording.gyro, to_nanoseconds(apart)
+    shifted = replace(recording, gyro=replace(gyro, stamps_ns=gyro.stamps_ns - shift_ns))
+    found = shifted.calibrated(settings.TRACKED_IN_IMAGES)
+    if not found.time_offset.observable:
+        return None
+    of_stamped_row = _offset_of_row(found, parameters.sensor.stamp_row)
+    offset = round(apart + of_stamped_row, _OFFSET_DIGITS)
+    tried = parameters.updated({'time_offset': offset})
+    bag.time_offset = offset
+    sample = sampled(sensor_messages(bag, topics, faulty=True), topics.image.count, tried)
+    return offset if sample.poses and sample.health.state is not FindingState.WRONG else None
+
+
+def _first_of_middle(topics: SensorTopics) -> int:
+    return max(topics.image.count - _CALIBRATED_IMAGES, 0) // 2
+
+
+def _offset_of_row(found: CalibrationResult, stamp_row: str) -> float:
+    """The time offset [s] of a calibration, which is that of row 0, for the stamped row."""
+    share = {'first': 0.0, 'middle': 0.5, 'last': 1.0}[stamp_row]
+    return found.time_offset.value + share * found.readout_time.value
 
 
 class Sample(NamedTuple):

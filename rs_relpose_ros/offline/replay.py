@@ -25,6 +25,7 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.timing import clocks_apart, NANOSECONDS
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.outgoing import pair_parts, PAIR_TOPICS
 from rs_relpose_ros.messages.streams import check_timelines
@@ -168,7 +169,19 @@ class Replay:
         nothing_taken = not self.sequencer.counts().frames_taken
         all_failed = self.failed_frames and not self.pair_count
         if most is not None and (nothing_taken or all_failed):
-            raise InputError(f'no frame of {self._bag.path} could be used: {most}')
+            apart = self._clocks_apart()
+            raise InputError(
+                f'no frame of {self._bag.path} could be used: {most}'
+                + (f'; as they were recorded, {apart}: "rs_relpose check" looks for the offset')
+                * bool(apart)
+            )
+
+    def _clocks_apart(self) -> str:
+        """Message on clocks that differ by the times of recording; '' if they do not."""
+        images, imu = self._bag.timeline(self._topics.image), self._bag.timeline(self._topics.imu)
+        delays = [float(np.median(one.received - one.stamps)) for one in (images, imu)]
+        ahead = (delays[0] - delays[1]) / NANOSECONDS
+        return clocks_apart(ahead + self.parameters.sensor.time_offset)
 
     @property
     def health(self) -> Assessment:
