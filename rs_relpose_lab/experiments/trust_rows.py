@@ -124,6 +124,18 @@ def _focal_length(factor: float) -> Change:
     )
 
 
+def _center(right: float, down: float) -> Change:
+    """The configured principal point is off, as of images that were cropped."""
+    return lambda configured, rng: replace(
+        configured,
+        intrinsics=replace(
+            configured.intrinsics,
+            cx=configured.intrinsics.cx + right,
+            cy=configured.intrinsics.cy + down,
+        ),
+    )
+
+
 def _readout(factor: float) -> tuple[Change, Error]:
     return (
         lambda right, rng: right.with_values(readout_time=factor * right.values['readout_time']),
@@ -276,6 +288,8 @@ ROWS: Mapping[str, Row] = {
     ),
     'gyro-0.95': Row(('gyro_scale',), SMALL, _gyro_times(0.95), _error('gyro_scale', 0.05)),
     'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97), _error('focal_length', 0.03)),
+    'center-36-left': Row(('principal_point',), SMALL, _center(36.0, 0.0)),
+    'center-20-top': Row(('principal_point',), SMALL, _center(0.0, 20.0)),
     'mirrored': Row(('image_geometry',), SMALL, _shown(MIRRORED)),
     # Reading up instead of down is an error of twice the readout time.
     'direction-reversed': Row(

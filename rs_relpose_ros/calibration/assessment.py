@@ -7,34 +7,31 @@ sigma of a correctly configured pose, *wrong* if it moves the pose out of its co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.findings import (
     Code,
+    Configured,
     Evidence,
     Finding,
     FindingState,
     Quantity,
     Why,
 )
-from rs_relpose_ros.calibration.posterior import Calibration
+from rs_relpose_ros.calibration.posterior import Calibration, OF_LENS
 from rs_relpose_ros.calibration.rotations import RotationComparison
-from rs_relpose_ros.config.settings import Parameters, SensorConfig
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import (
-    readout_direction,
-    REFERENCE_ROWS,
-    RollingShutterCamera,
-)
+from rs_relpose_ros.geometry.camera import readout_direction, REFERENCE_ROWS
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 
@@ -92,6 +89,9 @@ _LARGEST_GAIN = 100.0
 # Difference in chi-square below which another hypothesis fits as well. More would name two causes
 # where one is plain, less would name the wrong one of two. [derived: two sigmas]
 _AS_GOOD = 4.0
+# The same if one of the two can nearly cancel others, as the principal point does with the axes:
+# less would name one of them by chance. [derived: 5 in the log-likelihood]
+_CLEARLY = 10.0
 # Largest number of inconsistent quantities. Traces of a gross error need some, but with more of
 # seven the fit would be free. [chosen: 3 to 5 would do]
 _MOST_QUANTITIES = 4
@@ -103,38 +103,20 @@ _LITTLE_OF = 0.25
 _TRACE = 0.34
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Configured:
-    """Parameters with which the pairs were estimated."""
-
-    sensor: SensorConfig
-    camera: RollingShutterCamera
-    gyro_bias: Array  # (3,) parameter [rad/s]
-    sigmas: Array  # (K,) configured, of the deviations; 0 if not known
-    active: Array  # (K,) deviations applied already: tracked parameters, bias at rest
-    center_sigma: float = 0.0  # [px] of the principal point, per axis
-
-    @property
-    def direction(self) -> float:
-        """1 if row 0 is configured to be read first, -1 if it is the last."""
-        return 1.0 if self.camera.reads_forward else -1.0
-
-
-def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
+def configured_sigmas(parameters: Parameters, from_reference: float, width: int) -> Array:
     """1 sigma (K,) of the deviations by the parameters, 0 where they are not known.
 
     `from_reference` [s]: interval between frames less that to which the time offset refers.
+    `width` [px]: of the image.
     """
-    sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(LIVE.size)
-    sigmas[LIVE.part('axes')] = sensor.axes_sigma
-    sigmas[LIVE.part('gyro_bias')] = parameters.imu.gyro_bias_sigma
-    sigmas[LIVE.index('time_offset')] = math.hypot(
-        sensor.time_offset_sigma, (from_reference * sensor.time_offset_per_interval_sigma)
-    )
-    sigmas[LIVE.index('readout_time')] = sensor.readout_time_sigma
-    sigmas[LIVE.index('focal_log')] = lens.focal_length_sigma
-    sigmas[LIVE.index('distortion')] = lens.distortion_sigma
-    return sigmas
+    sensor, sigmas = parameters.sensor, np.zeros(LIVE.size)
+    for name, sigma in parameters.deviation_sigmas().items():
+        if name in LIVE.parts:
+            sigmas[LIVE.part(name)] = sigma
+    by_interval = from_reference * sensor.time_offset_per_interval_sigma
+    offset = LIVE.index('time_offset')
+    sigmas[offset] = math.hypot(sigmas[offset], by_interval)
+    return np.asarray(sigmas / LIVE.scales(width))
 
 
 class Effect(NamedTuple):
@@ -179,7 +161,8 @@ def find_inconsistencies(
         )[:2]
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
-        if not found and solution.gain(quantity.part) - other.gain(second.part) < _AS_GOOD:
+        needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
+        if not found and solution.evidence(quantity) - other.evidence(second) < needed:
             alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
@@ -195,13 +178,13 @@ def _ranked(
     estimated: Calibration,
     configured: Configured,
 ) -> list[tuple[Quantity, _Solution]]:
-    """Hypotheses that free one more quantity each; the one that gains most in chi-square first."""
+    """Hypotheses that free one more quantity each; the one with most evidence first."""
     return sorted(
         (
             (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
             for quantity in quantities
         ),
-        key=lambda item: -item[1].gain(item[0].part),
+        key=lambda item: -item[1].evidence(item[0]),
     )
 
 
@@ -227,12 +210,14 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
     Those within configured sigmas exist for certain (the gyro bias is in the covariance of a pair
     already). Whether another quantity is off is not known: before the first pair the odds are
     even, and each quantity as likely. Consistent pairs lower the odds of a quantity as they lower
-    its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995)::
+    its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995).
+    Unknown quantities may be off together, but those that are `alone`::
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
     odds, known = 0.0, configured.sigmas > 0.0
     known[LIVE.part('gyro_bias')] = False
+    together, alone = ~known, np.zeros((LIVE.size, LIVE.size))
     estimated = replace(estimated, shared=1.0)
     for quantity in findings.QUANTITIES:
         part = quantity.part
@@ -243,13 +228,17 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
                 float(solution.off[part] @ inverse(covariance) @ solution.off[part]), _LARGEST_GAIN
             )
             of_prior = -2.0 * float(np.log(LIVE.sigmas[part]).sum())
-            odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(
-                findings.QUANTITIES
-            )
+            evidence = math.exp(0.5 * (log_determinant(covariance) + of_prior + gain))
+            own_odds = evidence / len(findings.QUANTITIES)
+            odds += own_odds
+            if quantity.alone:
+                alone += own_odds * solution.moment
+                together[part] = False
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[LIVE.part('gyro_bias')] = within[:, LIVE.part('gyro_bias')] = 0.0
-    return share * _solved(~known, estimated, configured).moment + (1.0 - share) * within
+    others = share * _solved(together, estimated, configured).moment
+    return np.asarray(others + alone / (1.0 + odds) + (1.0 - share) * within)
 
 
 def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
@@ -298,6 +287,15 @@ class _Solution(NamedTuple):
         # A vector gains more by chance.
         return float(self.off[part] @ self._along(part)) - 2.0 * (part.stop - part.start - 1)
 
+    def evidence(self, quantity: Quantity) -> float:
+        """Chi-square in favour of a quantity.
+
+        What a deviation of the lens explains in each pair for itself gains as well, and counts as
+        far as the pairs agree.
+        """
+        part = quantity.part
+        return self.certainty(part) ** 2 if quantity.entry in OF_LENS else self.gain(part)
+
     def certainty(self, part: slice) -> float:
         """Some deviations in sigmas, as the parts of the pairs scatter in their direction."""
         along, gain = self._along(part), max(self.gain(part), 0.0)
@@ -308,8 +306,8 @@ class _Solution(NamedTuple):
 def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
     """Deviations, those `free` (K,) within their wide prior, others within configured sigmas."""
     sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
-    if free[LIVE.index('distortion')]:
-        factors = estimated.if_distorted
+    if free.any():
+        factors = estimated.if_free[:, free].max(axis=1)
         estimated = replace(
             estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
         )
@@ -466,36 +464,18 @@ def _values(
 
     `left`: deviation from the active values; of a vector, the most certain component is reported.
     """
-    camera, sensor = configured.camera, configured.sensor
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma = float(sigmas[worst])
     evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=len(calibration.b))
-    values: dict[Code, ArrayLike] = {  # active ones, in the unit of the quantity
-        Code.AXES: 0.0,
-        Code.TIME_OFFSET: sensor.time_offset + float(configured.active[LIVE.index('time_offset')]),
-        Code.READOUT_TIME: camera.readout_time,
-        Code.GYRO_BIAS: configured.gyro_bias + configured.active[LIVE.part('gyro_bias')],
-        Code.GYRO_SCALE: 1.0,
-        Code.FOCAL_LENGTH: camera.fx,
-        Code.DISTORTION: (*camera.distortion, 0.0)[0],
-    }
-    active = np.atleast_1d(np.asarray(values[quantity.code], dtype=np.float64))
-    estimated = active + left
-    if quantity.code is Code.AXES:
-        estimated = np.degrees([float(np.linalg.norm(left))])
-        sigma *= math.degrees(1.0)
-    elif quantity.code is Code.READOUT_TIME:  # the deviation is that of the signed one
-        estimated = active + configured.direction * left
-    elif quantity.code is Code.FOCAL_LENGTH:  # the deviation is that of its logarithm
-        estimated = active * np.exp(left)
-        sigma *= float(estimated[0])
+    active = np.atleast_1d(quantity.value(configured, np.zeros(len(left))))
+    estimated = np.atleast_1d(quantity.value(configured, left))
     return Finding(
         quantity.code,
         FindingState.OK,
         Why.CONSISTENT,
         tuple(active.tolist()),
         tuple(estimated.tolist()),
-        sigma,
+        sigma * quantity.per_deviation(configured, float(estimated[-1])),
         quantity.unit,
         component=worst if len(active) > 1 else 0,
         evidence=evidence,

@@ -4,7 +4,7 @@ A finding has codes and numbers; `findings_text` makes its text where it leaves 
 deviations of the quantities are values of the selection `LIVE` of `core.deviations`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 import math
@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 # Largest change of the time offset that tracking applies [s]. A larger one means that stamps mark
 # another event, which a human should know. [chosen: the prior sigma of the offset]
@@ -48,6 +51,7 @@ class Code(str, Enum):
     GYRO_SCALE = 'gyro_scale'
     FOCAL_LENGTH = 'focal_length'
     DISTORTION = 'distortion'
+    PRINCIPAL_POINT = 'principal_point'
     # Further causes that the consistency monitor names.
     READOUT_DIRECTION = 'readout_direction'
     GYRO_UNIT = 'gyro_unit'
@@ -230,15 +234,49 @@ def rounded(values: ArrayLike, digits: int = 5) -> list[float]:
     return [round(float(value), digits) + 0.0 for value in np.atleast_1d(values)]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Configured:
+    """Parameters with which the pairs were estimated."""
+
+    sensor: SensorConfig
+    camera: RollingShutterCamera
+    gyro_bias: Array  # (3,) parameter [rad/s]
+    sigmas: Array  # (K,) configured, of the deviations; 0 if not known
+    active: Array  # (K,) deviations applied already: tracked parameters, bias at rest
+
+    @property
+    def direction(self) -> float:
+        """1 if row 0 is configured to be read first, -1 if it is the last."""
+        return 1.0 if self.camera.reads_forward else -1.0
+
+
+class Shown(NamedTuple):
+    """How the values of a parameter are written."""
+
+    unit: str  # `factor` times smaller than the unit of the values
+    factor: float
+    digits: int
+    compared: str  # {}: the estimated and the active value
+    fix: str  # {}: the value to set
+
+
 class Quantity(NamedTuple):
     """A parameter of camera or IMU that images and gyro determine."""
 
     code: Code
     entry: str  # name of its deviation in `LIVE`
     observable: float  # largest sigma with which the deviation counts as observable
-    # Unit of the values of a finding. Deviations are in rad where this is deg, and relative where
-    # this is px.
+    # Unit of the values of a finding. Deviations are in rad where this is deg.
     unit: str
+    shown: Shown
+    # Values in `unit` by the deviation (m,) from the active ones.
+    value: Callable[[Configured, Array], ArrayLike]
+    # Change of a value by its deviation, at the estimated value.
+    per_deviation: Callable[[Configured, float], float] = lambda configured, estimated: 1.0
+    # Value that changes by all of itself with a deviation of 1, over the active one; 0: no value.
+    relative: float = 0.0
+    # Whether it is off alone, if at all: with others free it could cancel their effect.
+    alone: bool = False
     tracking: str = ''  # name of the parameter that lets the node track the quantity
     reach: float = 0.0  # largest deviation that tracking applies
 
@@ -255,20 +293,136 @@ class Quantity(NamedTuple):
         """Size of the difference between the values of a finding, in units of a deviation."""
         assert finding.estimate is not None and finding.active is not None
         apart = abs(finding.estimate - finding.active)
-        if self.unit == 'px':
-            return apart / finding.active
+        if self.relative:
+            return apart / (self.relative * finding.active)
         return math.radians(apart) if self.unit == 'deg' else apart
+
+
+# Text of an estimated and an active value.
+COMPARED = 'estimated {}, active {}'
+
+
+def _focal_length(configured: Configured, left: Array) -> Array:
+    return np.asarray(configured.camera.fx * np.exp(left))
+
+
+def _first_coefficient(configured: Configured, left: Array) -> Array:
+    return np.asarray((*configured.camera.distortion, 0.0)[0] + left)
+
+
+def _principal_point(configured: Configured, left: Array) -> Array:
+    camera = configured.camera
+    return np.asarray((camera.cx, camera.cy) + camera.width * left)
+
+
+def _time_offset(configured: Configured, left: Array) -> Array:
+    applied = float(configured.active[LIVE.index('time_offset')])
+    return np.asarray(configured.sensor.time_offset + applied + left)
+
+
+def _readout_time(configured: Configured, left: Array) -> Array:
+    # The deviation is that of the signed one.
+    return np.asarray(configured.camera.readout_time + configured.direction * left)
+
+
+def _gyro_bias(configured: Configured, left: Array) -> Array:
+    return np.asarray(configured.gyro_bias + configured.active[LIVE.part('gyro_bias')] + left)
 
 
 # The quantities in the order of messages.
 QUANTITIES = (
-    Quantity(Code.AXES, 'axes', math.radians(1.0), 'deg'),
-    Quantity(Code.TIME_OFFSET, 'time_offset', 4e-3, 's', 'track_time_offset', LARGEST_OFFSET),
-    Quantity(Code.READOUT_TIME, 'readout_time', 5e-3, 's', 'track_readout_time', LARGEST_READOUT),
-    Quantity(Code.GYRO_BIAS, 'gyro_bias', 0.01, 'rad/s'),
-    Quantity(Code.GYRO_SCALE, 'gyro_scale', 0.03, ''),
-    Quantity(Code.FOCAL_LENGTH, 'focal_log', 0.04, 'px'),
-    Quantity(Code.DISTORTION, 'distortion', 0.05, ''),
+    Quantity(
+        Code.AXES,
+        'axes',
+        math.radians(1.0),
+        'deg',
+        Shown(
+            'deg',
+            1.0,
+            2,
+            'IMU rotated by {} relative to quat_cam_imu_xyzw',
+            'set quat_cam_imu_xyzw: {}',
+        ),
+        lambda configured, left: np.degrees([float(np.linalg.norm(left))]),
+        lambda configured, estimated: math.degrees(1.0),
+    ),
+    Quantity(
+        Code.TIME_OFFSET,
+        'time_offset',
+        4e-3,
+        's',
+        Shown('ms', 1e3, 2, COMPARED, 'set time_offset: {:z.4f}'),
+        _time_offset,
+        tracking='track_time_offset',
+        reach=LARGEST_OFFSET,
+    ),
+    Quantity(
+        Code.READOUT_TIME,
+        'readout_time',
+        5e-3,
+        's',
+        Shown('ms', 1e3, 2, COMPARED, 'set readout_time: {:.4f}'),
+        _readout_time,
+        tracking='track_readout_time',
+        reach=LARGEST_READOUT,
+    ),
+    Quantity(
+        Code.GYRO_BIAS,
+        'gyro_bias',
+        0.01,
+        'rad/s',
+        Shown(
+            'rad/s',
+            1.0,
+            5,
+            COMPARED,
+            'set gyro_bias: {}, and keep the camera at rest at the start',
+        ),
+        _gyro_bias,
+    ),
+    Quantity(
+        Code.GYRO_SCALE,
+        'gyro_scale',
+        0.03,
+        '',
+        Shown(
+            '',
+            1.0,
+            3,
+            'factor of the gyro rates: ' + COMPARED,
+            'calibrate the gyro, or correct its driver',
+        ),
+        lambda configured, left: 1.0 + left,
+    ),
+    Quantity(
+        Code.FOCAL_LENGTH,
+        'focal_log',
+        0.04,
+        'px',
+        Shown('px', 1.0, 1, COMPARED, 'calibrate the camera at this resolution and focus'),
+        _focal_length,
+        lambda configured, estimated: estimated,
+        relative=1.0,
+    ),
+    Quantity(
+        Code.DISTORTION,
+        'distortion',
+        0.05,
+        '',
+        Shown('', 1.0, 3, 'first coefficient: ' + COMPARED, 'calibrate the lens'),
+        _first_coefficient,
+    ),
+    Quantity(
+        Code.PRINCIPAL_POINT,
+        'principal_point',
+        0.01,
+        'px',
+        Shown('px', 1.0, 1, COMPARED, 'calibrate the camera at this crop and resolution'),
+        _principal_point,
+        lambda configured, estimated: configured.camera.width,
+        relative=2.0,
+        alone=True,
+    ),
 )
 # The same by code.
 BY_CODE = {quantity.code: quantity for quantity in QUANTITIES}

@@ -4,7 +4,7 @@ No code reads a text back. What another process needs of a finding, `message_jso
 and numbers, and `read_message_json` makes the same finding of them, which has the same text.
 
 A new cause needs a function in `_BY_CAUSE`; a new parameter that images and gyro determine needs
-an entry in `_SHOWN` instead, and has the texts of the others.
+an entry in `findings.QUANTITIES` instead, and has the texts of the others.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike
 
 from rs_relpose_ros.calibration.findings import (
     Assessment,
+    BY_CODE,
     Code,
+    COMPARED,
     Evidence,
     Finding,
     FindingState,
@@ -44,59 +46,15 @@ class Text(NamedTuple):
         return self.message + (f': {self.fix}' if self.fix else '')
 
 
-class _Shown(NamedTuple):
-    """How the values of a parameter are written."""
-
-    unit: str  # `factor` times smaller than the unit of the values
-    factor: float
-    digits: int
-    compared: str  # {}: the estimated and the active value
-    fix: str  # {}: the value to set
-
-
-# Text of an estimated and an active value.
-_COMPARED = 'estimated {}, active {}'
-# How each parameter is written.
-_SHOWN = {
-    Code.AXES: _Shown(
-        'deg',
-        1.0,
-        2,
-        'IMU rotated by {} relative to quat_cam_imu_xyzw',
-        'set quat_cam_imu_xyzw: {}',
-    ),
-    Code.TIME_OFFSET: _Shown('ms', 1e3, 2, _COMPARED, 'set time_offset: {:z.4f}'),
-    Code.READOUT_TIME: _Shown('ms', 1e3, 2, _COMPARED, 'set readout_time: {:.4f}'),
-    Code.GYRO_BIAS: _Shown(
-        'rad/s',
-        1.0,
-        5,
-        _COMPARED,
-        'set gyro_bias: {}, and keep the camera at rest at the start',
-    ),
-    Code.GYRO_SCALE: _Shown(
-        '',
-        1.0,
-        3,
-        'factor of the gyro rates: ' + _COMPARED,
-        'calibrate the gyro, or correct its driver',
-    ),
-    Code.FOCAL_LENGTH: _Shown(
-        'px', 1.0, 1, _COMPARED, 'calibrate the camera at this resolution and focus'
-    ),
-    Code.DISTORTION: _Shown('', 1.0, 3, 'first coefficient: ' + _COMPARED, 'calibrate the lens'),
-}
-
-
 def with_sigma(code: Code, values: ArrayLike, sigma: float) -> str:
     """Values of a parameter with their sigma, in the unit of messages."""
-    shown = _SHOWN[code]
+    shown = BY_CODE[code].shown
     return f'{_number(code, values)} +- {_number(code, sigma)} {shown.unit}'.rstrip()
 
 
 def _number(code: Code, values: ArrayLike) -> str:
     """A value, or a list of those of a vector, in the unit of messages but without it."""
-    shown = _SHOWN[code]
+    shown = BY_CODE[code].shown
     scaled = shown.factor * np.atleast_1d(values)
     if len(scaled) > 1:
         return str(rounded(scaled, shown.digits))
@@ -148,7 +106,7 @@ def summary_lines(health: Assessment) -> list[str]:
 def _compared(finding: Finding) -> str:
     """Estimated and active value, in words."""
     assert finding.sigma is not None
-    shown = _SHOWN[finding.code]
+    shown = BY_CODE[finding.code].shown
     estimated = with_sigma(finding.code, finding.estimated, finding.sigma)
     active = f'{_number(finding.code, finding.configured)} {shown.unit}'.rstrip()
     return shown.compared.format(estimated, active)
@@ -157,7 +115,7 @@ def _compared(finding: Finding) -> str:
 def _off(finding: Finding) -> Text:
     """A parameter that the pairs contradict; the first of its settings is the value to set."""
     settings = finding.settings
-    fix = _SHOWN[finding.code].fix.format(*settings.values())
+    fix = BY_CODE[finding.code].shown.fix.format(*settings.values())
     for name in settings:
         if name.startswith('track_'):
             fix += f', or {name}: true'
@@ -171,7 +129,7 @@ def _off(finding: Finding) -> Text:
 
 
 def _by_calibration(finding: Finding) -> Text:
-    fix = _SHOWN[finding.code].fix.format(*finding.settings.values())
+    fix = BY_CODE[finding.code].shown.fix.format(*finding.settings.values())
     return Text(f'by a calibration: {_compared(finding)}', fix)
 
 
@@ -210,7 +168,7 @@ def _direction_by_calibration(finding: Finding) -> Text:
     estimated = with_sigma(Code.READOUT_TIME, -finding.estimate, finding.sigma)
     active = f'{_number(Code.READOUT_TIME, finding.configured)} ms'
     return Text(
-        f'by a calibration: {_COMPARED.format(estimated, active)}, in the opposite direction',
+        f'by a calibration: {COMPARED.format(estimated, active)}, in the opposite direction',
         _other_direction(finding),
     )
 

@@ -18,12 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.core.deviations import (
     by_stamped_row,
-    COMMON,
-    FIRST,
     LENS,
     LIVE,
     N_DEVIATIONS,
-    Selection,
+    PARTS,
 )
 from rs_relpose_ros.core.epipolar import derivatives
 from rs_relpose_ros.core.least_squares import inverse
@@ -69,17 +67,14 @@ _UNKNOWN_VELOCITY = 30.0
 # Steps of a new fit of a pair, which starts near its optimum. Fewer would leave it off, more cost
 # time. [chosen: Gauss-Newton is quadratic; 3 to 5 would do]
 _NEW_STEPS = 3
-# Deviations of which the pose has a doubt: the principal point is not estimated, since axes of the
-# IMU have nearly the same effect.
-_DOUBTED = Selection.of(*LIVE.parts, 'principal_point', gyro_scale=COMMON, distortion=FIRST)
 # Places of single deviations in the vector c: of the time offset of the stamped row,
 _OFFSET = LIVE.index('time_offset')
 # of the readout time,
 _READOUT = LIVE.index('readout_time')
-# and of the first coefficient of the distortion.
-_DISTORTION = LIVE.index('distortion')
 # Number of deviations before those of the lens, which come last.
-_LENS = LIVE.index('focal_log')
+_LENS = LIVE.part('focal_log').start
+# Deviations that leave a pattern in the image: the entries of the lens.
+OF_LENS = tuple(name for name in LIVE.parts if LENS.start <= PARTS[name].start < LENS.stop)
 # Of a state: rotation and direction of translation.
 _POSE = np.r_[THETA : THETA + 3, TANGENT : TANGENT + 2]
 
@@ -107,9 +102,9 @@ class PairInformation:
 
     S: Array  # (K, K)
     b: Array  # (K,)
-    if_distorted: float  # factor of both if the distortion is free: its residuals are no noise
+    # (K,) factors of both if a deviation is free: its residuals are no noise.
+    if_free: Array
     pose_by_deviation: Array  # (6, K) of (dt, dtheta) in camera 1, first order
-    pose_by_center: Array  # (6, 2) the same by the principal point [px]
     # (5, K) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
     images_against_gyro: Array  # (3,) [rad] Log of the rotation by images alone and R_gyro^T
@@ -118,7 +113,7 @@ class PairInformation:
 
 
 class _Linearised(NamedTuple):
-    """A pair at its fitted state: residuals, and derivatives by the state and C deviations.
+    """A pair at its fitted state: residuals, and derivatives by the state and K deviations.
 
     The matches depend on both. The rotation by the gyro is a prior of the state, and the gyro
     depends on the deviations: ``theta = Log(R R_gyro^T)`` becomes smaller by ``gyro dc``.
@@ -128,10 +123,12 @@ class _Linearised(NamedTuple):
     observations: Array  # (N, 20) rows of `sampson`
     residuals: Array  # (N,) [px]
     by_state: Array  # (N, 17)
-    by_deviation: Array  # (N, C)
+    by_deviation: Array  # (N, K)
+    by_image: Array  # (N, 9) by the deviations of IMAGES
     prior: priors.Priors  # of the state
     theta: Array  # (3,)
-    gyro: Array  # (3, C) rotation of R_gyro, on its left
+    gyro: Array  # (3, K) rotation of R_gyro, on its left
+    gyro_by_image: Array  # (3, 9) the same
 
 
 class _Normal(NamedTuple):
@@ -139,9 +136,9 @@ class _Normal(NamedTuple):
 
     H: Array  # (17, 17)
     gradient: Array  # (17,)
-    mixed: Array  # (17, C)
-    own: Array  # (C, C)
-    own_gradient: Array  # (C,)
+    mixed: Array  # (17, K)
+    own: Array  # (K, K)
+    own_gradient: Array  # (K,)
 
 
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
@@ -163,13 +160,12 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     solved = inverse(normal.H) @ np.column_stack([normal.mixed, normal.gradient])
     if not np.isfinite(solved).all():
         return None
-    estimated = slice(0, LIVE.size)
-    S = (normal.own - normal.mixed.T @ solved[:, :-1])[estimated, estimated]
+    S = normal.own - normal.mixed.T @ solved[:, :-1]
     S = 0.5 * (S + S.T)
-    b = (normal.mixed.T @ solved[:, -1] - normal.own_gradient)[estimated]
-    ratio, if_distorted = _common_noise(
+    b = normal.mixed.T @ solved[:, -1] - normal.own_gradient
+    ratio, if_free = _common_noise(
         FitMatches(linear.observations, weights, 1.0),
-        (linear.by_deviation - linear.by_state @ solved[:, :-1])[:, estimated],
+        linear.by_deviation - linear.by_state @ solved[:, :-1],
         linear.residuals - linear.by_state @ solved[:, -1],
         S,
     )
@@ -178,12 +174,13 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     return PairInformation(
         S,
         b + S @ about,
-        ratio / if_distorted,
-        by_deviation[:, estimated],
-        by_deviation[:, LIVE.size :],
-        whitened[:, estimated],
+        ratio / if_free,
+        by_deviation,
+        whitened,
         _images_against_gyro(linear, normal, information),
-        _images_by_deviation(linear, normal, information, bool(np.isfinite(pair.t).all())),
+        _images_by_deviation(
+            linear, weights, normal, information, bool(np.isfinite(pair.t).all())
+        ),
     )
 
 
@@ -192,7 +189,7 @@ def thinned(pair: PairData, at: Array) -> PairData:
     step = math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
     return replace(
         pair,
-        camera=_lens(pair.camera, *at[_LENS:]),
+        camera=_with_lens(pair.camera, tuple(at[_LENS:])),
         points1=pair.points1[::step],
         points2=pair.points2[::step],
     )
@@ -268,7 +265,9 @@ def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -
 
 def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearised:
     """The pair fitted at deviations `at` (K,) from the active ones, and linearised there."""
-    basis = by_stamped_row(_DOUBTED, middle_share(pair.camera))
+    share = middle_share(pair.camera)
+    basis = by_stamped_row(LIVE, share) * LIVE.scales(pair.camera.width)
+    of_images = by_stamped_row(IMAGES, share)
     turning = basis[:, :_LENS] @ at[:_LENS]  # the lens is in the camera already
     frames = [frame_rows(pair, problem, image, turning) for image in (0, 1)]
     observations = np.column_stack(
@@ -295,9 +294,11 @@ def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearis
         residuals,
         jacobian(observations, state),
         by_deviation @ basis,
+        by_deviation @ of_images,
         prior,
         so3.log_so3(np.ascontiguousarray(state.R @ rotation.T)),
         gyro @ basis,
+        gyro @ of_images,
     )
 
 
@@ -330,10 +331,8 @@ def residuals_by_deviation(state: TwoViewState, frames: list[FrameRows]) -> tupl
 
 def _gyro(pair: PairData) -> Array:
     """Rotation (3, D) of the gyro's rotation between the middle rows by all deviations."""
-    segment = pair.segment
-    times = (segment.stamps_ns - segment.stamps_ns[0]) * 1e-9
-    path = GyroPath.integrated(times, np.ascontiguousarray(segment.angular_velocities))
-    return row_states(path, pair.R_cam_imu, times[-1:], np.zeros(1)).by_deviation[0]
+    path = pair.segment.path
+    return row_states(path, pair.R_cam_imu, path.times[-1:], np.zeros(1)).by_deviation[0]
 
 
 def _normal_equations(linear: _Linearised, weights: Array, information: Array) -> _Normal:
@@ -364,7 +363,7 @@ def _images_against_gyro(linear: _Linearised, normal: _Normal, information: Arra
 
 
 def _images_by_deviation(
-    linear: _Linearised, normal: _Normal, information: Array, has_direction: bool
+    linear: _Linearised, weights: Array, normal: _Normal, information: Array, has_direction: bool
 ) -> Array:
     """Change of pose and velocities by the images alone (11, 9) with the deviations of IMAGES.
 
@@ -374,26 +373,23 @@ def _images_by_deviation(
     of_theta = slice(THETA, THETA + 3)
     of_priors, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     priors.add_priors(linear.state, linear.prior, of_priors, gradient)
-    H, mixed = normal.H - of_priors, normal.mixed.copy()
+    H = normal.H - of_priors
     H[POSE:, POSE:] += linear.prior.rate_weight * np.eye(PARAMETERS - POSE)
-    mixed[of_theta] += information @ linear.gyro
-    moved = np.zeros((POSE, mixed.shape[1]))
+    mixed = (linear.by_state.T * weights) @ linear.by_image
+    moved = np.zeros((POSE, IMAGES.size))
     if has_direction:
         velocities = slice(TANGENT + 2, POSE)
         H[velocities, velocities] += _UNKNOWN_VELOCITY**-2 * np.eye(6)
         moved[:] = -(inverse(H) @ mixed)[:POSE]
     else:
         moved[of_theta] = -np.linalg.solve(H[of_theta, of_theta], mixed[of_theta])
-    by_deviation = np.empty((POSE, IMAGES.size))
-    for name, columns in IMAGES.parts.items():
-        by_deviation[:, columns] = moved[:, _DOUBTED.part(name)]
-    return by_deviation
+    return moved
 
 
 def _shifts(
     pair: PairData, problem: TwoViewProblem, linear: _Linearised, normal: _Normal
 ) -> tuple[Array, Array]:
-    """Shift of the estimated pose by C deviations, (6, C), and whitened, (5, C).
+    """Shift of the estimated pose by the deviations, (6, K), and whitened, (5, K).
 
     With the prior of the estimate for the gyro's rotation. The state is that at the middle row,
     which a longer readout time delays by D = share c against the stamped row:
@@ -420,22 +416,17 @@ def _shifts(
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
-def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, float]:
+def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, Array]:
     """Variance of the score of the matches by image regions, over that by S; at least 1.
 
-    The second value is without residuals that a distortion explains. J (N, K), r (N,):
+    The second one (K,) is without the residuals that a deviation of the lens explains, for each
+    deviation: its pattern in the image is no noise if the deviation is free. J (N, K), r (N,):
     derivatives and residuals of the fitted matches, S (K, K): information of the pair.
     """
     scale = np.outer(LIVE.sigmas, LIVE.sigmas)
     covariance = inverse(S * scale + np.eye(LIVE.size)) * scale
     in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
-    along = J[:, _DISTORTION]
     information = J.T * matches.weights @ J
-    without = r - along * (
-        (along * matches.weights)
-        @ r
-        / (np.diag(information)[_DISTORTION] + LIVE.sigmas[_DISTORTION] ** -2.0)
-    )
     independent = float((covariance * information).sum())
 
     def ratio(left: Array) -> float:
@@ -443,7 +434,14 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
         return max((1.0 + float(((sums @ covariance) * sums).sum())) / (1.0 + independent), 1.0)
 
     by_regions = ratio(r)
-    return by_regions, min(ratio(without), by_regions)
+    if_free = np.full(LIVE.size, by_regions)
+    for name in OF_LENS:
+        part = LIVE.part(name)
+        along = J[:, part]
+        own = information[part, part] + np.diag(LIVE.sigmas[part] ** -2.0)
+        explained = along @ np.linalg.solve(own, (along.T * matches.weights) @ r)
+        if_free[part] = min(ratio(r - explained), by_regions)
+    return by_regions, if_free
 
 
 def _state(
@@ -469,11 +467,12 @@ def _state(
 
 
 @functools.lru_cache(maxsize=16)
-def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
-    """The camera with deviations of focal length and distortion."""
-    if not (focal or distortion):
+def _with_lens(camera: RollingShutterCamera, lens: tuple[float, ...]) -> RollingShutterCamera:
+    """The camera with deviations of its lens, the last ones of `LIVE`."""
+    if not any(lens):
         return camera
-    return camera.moved_lens(LIVE.basis[LENS, _LENS:] @ (focal, distortion))
+    basis = LIVE.basis[LENS, _LENS:] * LIVE.scales(camera.width)[_LENS:]
+    return camera.moved_lens(basis @ lens)
 
 
 def middle_share(camera: RollingShutterCamera) -> float:
@@ -565,7 +564,7 @@ class Calibration:
     covariance: Array  # (K, K)
     S: Array  # (N, K, K) and (N, K): of the pairs, without a prior
     b: Array
-    if_distorted: Array  # (N,) factors of these
+    if_free: Array  # (N, K) factors of these if a deviation is free
     about: Array  # (K,) about which they are linearised, in the mean by their information
     scatter: float  # variance of the scores over that by S: 1 where residuals are independent
     shared: float  # factor of the variances by errors that are common to all pairs
@@ -583,7 +582,7 @@ NOTHING_ESTIMATED = Calibration(
     np.diag(LIVE.sigmas**2),
     np.zeros((0, LIVE.size, LIVE.size)),
     np.zeros((0, LIVE.size)),
-    np.zeros(0),
+    np.zeros((0, LIVE.size)),
     np.zeros(LIVE.size),
     1.0,
     1.0,
@@ -662,9 +661,9 @@ class Posterior:
         n = len(self._pairs)
         if not n:
             return NOTHING_ESTIMATED
-        S, b, if_distorted = (
+        S, b, if_free = (
             np.array([getattr(pair.information, name) for pair in self._pairs])
-            for name in ('S', 'b', 'if_distorted')
+            for name in ('S', 'b', 'if_free')
         )
         # Scaled by the prior: the deviations have different units.
         scale = LIVE.sigmas
@@ -685,7 +684,7 @@ class Posterior:
             shared * covariance * np.sqrt(np.outer(ratios, ratios)),
             S,
             b,
-            if_distorted,
+            if_free,
             about,
             float(np.median(ratios)),
             shared,

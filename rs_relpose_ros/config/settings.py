@@ -42,6 +42,7 @@ class Declared:
     live: bool = False  # a running node may change it
     restarts: bool = False  # it may, and begins again with the new value
     kind: type = float
+    deviation: str = ''  # name in `core.deviations` of the deviation whose sigma this is
 
     @property
     def legal(self) -> str:
@@ -244,6 +245,7 @@ class ImuConfig(Settings):
         low=0.0,
         high=1.0,
         restarts=True,
+        deviation='gyro_bias',
     )
     accel_noise_density: float = setting(
         3e-3, 'white noise of the accelerometer', 'm/s^2/sqrt(Hz)', low=1e-6, high=10.0
@@ -554,10 +556,16 @@ def pinhole_of_matrix(name: str, k: Sequence[float]) -> dict[str, Any]:
     return {'fx': fx, 'fy': fy, 'cx': cx, 'cy': cy}
 
 
-def _sigma(of: str, unit: str, high: float, per: str = '') -> Any:
-    """Sigma of a calibrated parameter."""
+def _sigma(of: str, unit: str, high: float, per: str = '', *, deviation: str = '') -> Any:
+    """Sigma of a calibrated parameter, which is the sigma of a `deviation`."""
     return setting(
-        0.0, f'{of}, 1 sigma{per}; 0 if it is not known', unit, low=0.0, high=high, restarts=True
+        0.0,
+        f'{of}, 1 sigma{per}; 0 if it is not known',
+        unit,
+        low=0.0,
+        high=high,
+        restarts=True,
+        deviation=deviation,
     )
 
 
@@ -586,12 +594,18 @@ class IntrinsicsConfig(Settings):
         kind=tuple,
         restarts=True,
     )
-    focal_length_sigma: float = _sigma('relative uncertainty of the focal length', '', 1.0)
+    focal_length_sigma: float = _sigma(
+        'relative uncertainty of the focal length', '', 1.0, deviation='focal_log'
+    )
     distortion_sigma: float = _sigma(
-        'uncertainty of the first of distortion_coefficients', '', 10.0
+        'uncertainty of the first of distortion_coefficients', '', 10.0, deviation='distortion'
     )
     principal_point_sigma: float = _sigma(
-        'uncertainty of the principal point', 'px', 1e4, ' per axis'
+        'uncertainty of the principal point',
+        'px',
+        1e4,
+        ' per axis',
+        deviation='principal_point',
     )
 
     def __post_init__(self) -> None:
@@ -640,7 +654,9 @@ class SensorConfig(Settings):
         kind=float,
         restarts=True,
     )
-    readout_time_sigma: float = _sigma('uncertainty of readout_time', 's', 1.0)
+    readout_time_sigma: float = _sigma(
+        'uncertainty of readout_time', 's', 1.0, deviation='readout_time'
+    )
     readout_direction: str = setting(
         'down',
         'whether row 0 is read first (down) or last (up); for images turned by 90 deg, whose '
@@ -689,7 +705,9 @@ class SensorConfig(Settings):
         high=1e5,
         restarts=True,
     )
-    time_offset_sigma: float = _sigma('uncertainty of time_offset', 's', 10.0)
+    time_offset_sigma: float = _sigma(
+        'uncertainty of time_offset', 's', 10.0, deviation='time_offset'
+    )
     time_offset_per_interval: float = setting(
         0.0,
         'change of time_offset with the interval T between frames (automatic exposure): '
@@ -730,7 +748,9 @@ class SensorConfig(Settings):
         kind=tuple,
         restarts=True,
     )
-    axes_sigma: float = _sigma('uncertainty of quat_cam_imu_xyzw', 'rad', 1.0, ' per axis')
+    axes_sigma: float = _sigma(
+        'uncertainty of quat_cam_imu_xyzw', 'rad', 1.0, ' per axis', deviation='axes'
+    )
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -884,6 +904,15 @@ class Parameters:
         for group in dataclasses.fields(Parameters):
             for item in dataclasses.fields(group.default_factory):  # type: ignore[arg-type]
                 yield item.name, item.default, declared(item)
+
+    def deviation_sigmas(self) -> dict[str, float]:
+        """Configured sigmas by the names of their deviations; 0 where they are not known."""
+        return {
+            declared(item).deviation: getattr(group, item.name)
+            for group in (self.sensor, self.imu, self.intrinsics)
+            for item in dataclasses.fields(group)
+            if declared(item).deviation
+        }
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Parameters:

@@ -56,7 +56,8 @@ ENTRIES = (
     Entry('aspect', 1, '', 0.002, 0.01),
     # Coefficients k1, k2, k3.
     Entry('distortion', 3, '', 0.5, 0.6),
-    Entry('principal_point', 2, 'px', 10.0, 50.0),
+    # [px] in the whole vector, in widths of the image where `Selection.scales` is applied.
+    Entry('principal_point', 2, 'width', 0.015, 0.1),
 )
 
 
@@ -127,6 +128,14 @@ class Selection:
             raise ValueError(f'{name} has more than one value')
         return int(part.start)
 
+    def scales(self, width: int) -> Array:
+        """Factors (k,) from values in the units of `ENTRIES` to the whole vector: a width [px]."""
+        units = {entry.name: width if entry.unit == 'width' else 1 for entry in ENTRIES}
+        scales = np.ones(self.size)
+        for name, part in self.parts.items():
+            scales[part] = units[name]
+        return scales
+
     def mask(self, *names: str) -> NDArray[np.bool_]:
         """Which of the values (k,) belong to these entries."""
         chosen = np.zeros(self.size, dtype=bool)
@@ -143,6 +152,7 @@ LIVE = Selection.of(
     'readout_time',
     'gyro_bias',
     'focal_log',
+    'principal_point',
     gyro_scale=COMMON,
     distortion=FIRST,
 )

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import MOTIONS
+from rs_relpose_ros.core.deviations import LENS, LIVE, Selection
 from rs_relpose_ros.core.reprojection import (
     ACCELERATION,
     BIAS,
+    Changes,
     empty_blocks,
     fill_view,
     FrameInertia,
@@ -28,12 +30,15 @@ from rs_relpose_ros.core.reprojection import (
     TO_PIXELS,
     TrackBlocks,
 )
+from rs_relpose_ros.core.rows import row_states
 from rs_relpose_ros.estimator import adjustment
 from rs_relpose_ros.estimator.adjustment import Adjusted, PathPriors, PathState
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.gyro import GyroPath
+from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import by_axes, exp_so3, log_so3, median, skew, tangent_basis
 
 # Error of gravity and accelerometer together, 1 sigma per axis [m/s^2]: a camera in motion does
@@ -109,13 +114,22 @@ def refined(
             frames_reason='tracks and gyro of the frames between contradict each '
             f'other: {adjusted.sigma:.1f} px',
         )
-    return _result(
+    refined_pose = _result(
         pose,
         adjusted,
         path,
         tracks,
         priors,
     )
+    changes = _changes_by(LIVE, path)
+    if changes is None:
+        return refined_pose
+    # The noise of the fit, with the error that residuals do not show.
+    noise = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
+    moved = adjustment.path_by_deviations(tracks, priors, state, noise, changes)
+    by_deviation = _pose_by_path(adjusted, tracks) @ moved
+    by_deviation[3:] += changes.rotations[-1]
+    return replace(refined_pose, by_deviation=by_deviation)
 
 
 def _with_inliers(
@@ -355,10 +369,7 @@ def _result(
     T = tracks.duration
     off = T * state.bias + state.rotations[-1]  # from the gyro's rotation
     R = exp_so3(off) @ tracks.rotations[-1]
-    by_state = np.zeros((6, len(C)))
-    by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
-    by_state[3:, BIAS : BIAS + 3] = T * np.eye(3)
-    by_state[3:, -3:] = np.eye(3)
+    by_state = _pose_by_path(adjusted, tracks)
     velocities, (by_first, by_second) = _velocities(state, path, len(C))
     # R^T p' rotates with the error of R.
     by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])
@@ -391,6 +402,15 @@ def _result(
     )
 
 
+def _pose_by_path(adjusted: Adjusted, tracks: TrackBlocks) -> Array:
+    """Derivative (6, n) of the pose by the unknowns of the path."""
+    by_path = np.zeros((6, len(adjusted.covariance)))
+    by_path[:3, TANGENT:LOG_SCALE] = tangent_basis(adjusted.state.t)
+    by_path[3:, BIAS : BIAS + 3] = tracks.duration * np.eye(3)
+    by_path[3:, -3:] = np.eye(3)
+    return by_path
+
+
 def _velocities(
     state: PathState,
     path: PairProblem,
@@ -408,3 +428,50 @@ def _velocities(
     of_accelerations = derivatives[..., ACCELERATION:]
     of_accelerations[..., : bends.shape[1] * 3] = k * by_axes(bends).reshape(2, 3, -1)
     return state.t / T + of_scale, derivatives
+
+
+# -- What deviations of the configuration change in the observations ------------------------------
+#
+# The reference of the rows of a frame is its stamped row: shares of the readout are counted from
+# it, and the time offset of a selection is the one of the stamped row, as the parameter.
+
+
+def _changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
+    """Changes of rays, times and rotations by a selection; None without the gyro of the pair.
+
+    Observations that are not used have arbitrary values.
+    """
+    if problem.gyro is None or problem.R_cam_imu is None:
+        return None
+    camera, points = problem.camera, problem.matches.points
+    views, count = points.shape[:2]
+    basis = selection.basis * selection.scales(camera.width)
+    # The gyro covers the rows of the image only: other observations are put into its middle.
+    rows = camera.rows_of(points)
+    inside = np.isfinite(points).all(axis=2) & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
+    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
+    pixels = np.where(inside[..., None], points, middle)
+    rows = camera.rows_of(pixels)
+    lens = camera.rays_by_lens(pixels.reshape(-1, 2)).by_lens @ basis[LENS]
+    rays = camera.unproject(pixels.reshape(-1, 2)).reshape(views, count, 3)
+    by_lens = lens.reshape(views, count, 3, selection.size)
+    shares = (rows - camera.reference_row_index) / camera.row_count
+    times = camera.row_times(rows)
+    of_rays = np.empty((views, count, 3, selection.size))
+    of_times = np.empty((views, count, selection.size))
+    for view, motion in enumerate(problem.motions):
+        path = _path_of_rows(motion)
+        states = row_states(path, problem.R_cam_imu, times[view], shares[view])
+        turned = np.einsum('nij,nj->ni', states.rotation, rays[view])
+        by_turn = np.cross(states.by_deviation @ basis, turned[:, :, None], axis=1)
+        of_rays[view] = by_turn + states.rotation @ by_lens[view]
+        of_times[view] = states.time_by_deviation @ basis
+    between = row_states(problem.gyro, problem.R_cam_imu, problem.seconds, np.zeros(views))
+    return Changes(of_rays, of_times, np.ascontiguousarray(between.by_deviation @ basis))
+
+
+def _path_of_rows(motion: FrameMotion) -> GyroPath:
+    """The rotation within a frame, also where it is known by its rate alone."""
+    if motion.path is not None:
+        return motion.path
+    return GyroPath.constant(motion.angular_velocity, -1.0, 1.0)

@@ -11,6 +11,7 @@ from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 
@@ -35,6 +36,10 @@ class PairProblem:
     config: EstimatorConfig
     seed: int  # of the random samples
     no_inertial: str = ''  # why the accelerometer is not used; empty if nobody has asked for it
+    # For the change of the pose by deviations of the configuration; None if it is not needed. The
+    # gyro from the first frame to the last one, relative to the first reference row at time 0.
+    gyro: GyroPath | None = None
+    R_cam_imu: Array | None = None
 
     @property
     def interval(self) -> float | None:

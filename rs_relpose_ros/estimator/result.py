@@ -130,6 +130,9 @@ class RelativePose:
         One per match.
     images : ImageInformation or None
         Information of the images alone, without the priors of the IMU; None if there is none.
+    by_deviation : (6, K) ndarray or None
+        Change of ``(dt, dtheta)`` by the deviations `LIVE` of `core.deviations`, if the pose is
+        from all frames of the pair; None if it was not computed.
     pixels1_gs, pixels2_gs : (N, 2) ndarray or None
         Equivalent global-shutter pixels of the matches at the times of the reference rows, on the
         sensor: NaN for outliers; None unless requested, and without a pose.
@@ -152,6 +155,7 @@ class RelativePose:
     baseline_log_sigma: float = math.nan
     inliers: Flags = field(default_factory=lambda: np.zeros(0, dtype=bool))
     images: ImageInformation | None = None
+    by_deviation: Array | None = None
     pixels1_gs: Array | None = None
     pixels2_gs: Array | None = None
     diagnostics: Diagnostics = Diagnostics()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array, so3, validate
-from rs_relpose_ros.geometry.gyro import integrated_rotations
+from rs_relpose_ros.geometry.gyro import GyroPath, integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.geometry.timing import seconds_between, Stamps
@@ -39,6 +39,12 @@ class ImuSlice:
     def duration(self) -> float:
         """Seconds from the first to the last sample."""
         return seconds_between(int(self.stamps_ns[0]), int(self.stamps_ns[-1]))
+
+    @property
+    def path(self) -> GyroPath:
+        """The integrated gyro, relative to the first sample, whose time is 0."""
+        times = (self.stamps_ns - self.stamps_ns[0]) * 1e-9
+        return GyroPath.integrated(times, np.ascontiguousarray(self.angular_velocities))
 
     @property
     def rotation(self) -> Array:

@@ -105,16 +105,12 @@ class Doubts:
 
 def _configured_sigmas(parameters: Parameters) -> Array:
     """Sigmas of the deviations of IMAGES; 0 for one that is taken as exact."""
-    sensor, lens = parameters.sensor, parameters.intrinsics
+    configured = parameters.deviation_sigmas()
     # A parameter that relpose_node tracks is not constant: its deviation is no unknown.
-    configured = {
-        'axes': sensor.axes_sigma,
-        'time_offset': 0.0 if sensor.track_time_offset else sensor.time_offset_sigma,
-        'readout_time': 0.0 if sensor.track_readout_time else sensor.readout_time_sigma,
-        'focal_log': lens.focal_length_sigma,
-        'distortion': lens.distortion_sigma,
-        'principal_point': lens.principal_point_sigma,
-    }
+    if parameters.sensor.track_time_offset:
+        configured['time_offset'] = 0.0
+    if parameters.sensor.track_readout_time:
+        configured['readout_time'] = 0.0
     sigmas = np.zeros(IMAGES.size)
     for name, columns in IMAGES.parts.items():
         sigmas[columns] = configured[name]

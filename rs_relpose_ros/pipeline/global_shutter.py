@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibration.assessment import Configured
-from rs_relpose_ros.calibration.findings import Assessment
+from rs_relpose_ros.calibration.findings import Assessment, Configured
 from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.core.deviations import LIVE

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
-from rs_relpose_ros.calibration.assessment import Configured, Effect, Inconsistency
-from rs_relpose_ros.calibration.findings import Assessment, Finding
+from rs_relpose_ros.calibration.assessment import Effect, Inconsistency
+from rs_relpose_ros.calibration.findings import Assessment, Configured, Finding
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
 from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
@@ -98,23 +98,22 @@ class ConsistencyMonitor:
             )
             if information is None:
                 return pose
-            self._due = self._due._replace(information=information)
             self.calibration = self._recursion.solved()
+            if pose.by_deviation is not None:
+                # The published pose is the one of all frames, which depends less on deviations.
+                information = replace(information, pose_by_deviation=pose.by_deviation)
+                self.latest = information
+            self._due = self._due._replace(information=information)
             by_deviation = information.pose_by_deviation
             shift = by_deviation @ self._deviation()
-            by_center = configured.center_sigma * information.pose_by_center
             if self._undetermined is None:
                 self._undetermined = assessment.undetermined(self.calibration, configured)
         except np.linalg.LinAlgError:
             # A pair without rank has no information on the calibration; its pose is kept.
             self._inconsistent = []
             return pose
-        # The inconsistency, deviations that the pairs so far have not excluded, and the center.
-        doubt = (
-            np.outer(shift, shift)
-            + by_center @ by_center.T
-            + (by_deviation @ self._undetermined @ by_deviation.T)
-        )
+        # The inconsistency, and deviations that the pairs so far have not excluded.
+        doubt = np.outer(shift, shift) + by_deviation @ self._undetermined @ by_deviation.T
         images = pose.images and pose.images.moved_by(information.images_by_deviation)
         widened = replace(pose, covariance=pose.covariance + doubt, images=images)
         # The effect of an inconsistent parameter on the baseline is not known.

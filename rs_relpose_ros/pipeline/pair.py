@@ -391,6 +391,8 @@ class TrackHistory:
             ),
             int(np.random.default_rng(seed).integers(2**63)),
             reason,
+            None if slices[-1] is None else slices[-1].path,
+            parameters.sensor.R_cam_imu,
         )
 
     def _accelerations(

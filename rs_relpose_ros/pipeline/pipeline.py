@@ -11,7 +11,8 @@ from typing import Any, Generic
 import numpy as np
 
 from rs_relpose_ros.calibration import findings
-from rs_relpose_ros.calibration.assessment import Configured, configured_sigmas
+from rs_relpose_ros.calibration.assessment import configured_sigmas
+from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import PairData
 from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
 from rs_relpose_ros.config.settings import Parameters, sensor_model
@@ -368,9 +369,8 @@ class Pipeline(Processor[PairResult]):
             parameters.sensor,
             sensor.camera,
             bias,
-            configured_sigmas(parameters, from_reference),
+            configured_sigmas(parameters, from_reference, sensor.camera.width),
             np.zeros(LIVE.size),
-            parameters.intrinsics.principal_point_sigma,
         )
         configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
         configured.active[LIVE.index('readout_time')] = configured.direction * self._readout

@@ -29,6 +29,7 @@ from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import MODES
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3
@@ -136,6 +137,8 @@ def _problem() -> PairProblem:
         (None,) * 3,
         EstimatorConfig(),
         0,
+        gyro=GyroPath.constant(np.zeros(3), 0.0, 0.2),
+        R_cam_imu=np.eye(3),
     )
 
 
