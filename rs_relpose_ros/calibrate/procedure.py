@@ -794,7 +794,8 @@ class Recorder:
         self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
         self.size = (0, 0)  # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
-        self._last_sample: tuple[int, tuple[float, ...]] = (0, ())  # of those that are kept
+        self._last_rates: tuple[float, ...] = ()  # of the last sample
+        self._changed_ns = 0  # stamp of the first sample with these rates
 
     @property
     def seconds(self) -> float:
@@ -829,10 +830,10 @@ class Recorder:
 
     def _is_held(self, stamp_ns: int, rates: tuple[float, float, float]) -> bool:
         """Whether a driver has repeated the last sample; its stamp would make the gyro late."""
-        since_ns = stamp_ns - self._last_sample[0]
-        if rates == self._last_sample[1] and 0 <= since_ns < _LONGEST_HELD_NS:
-            return True
-        self._last_sample = stamp_ns, rates
+        since_ns = stamp_ns - self._changed_ns
+        if rates == self._last_rates:
+            return 0 <= since_ns < _LONGEST_HELD_NS
+        self._last_rates, self._changed_ns = rates, stamp_ns
         return False
 
     def follow(self, encoded: EncodedImage) -> None:
