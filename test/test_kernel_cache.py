@@ -198,17 +198,13 @@ def test_every_import_of_a_kernels_module_counts(monkeypatch):
 
 
 # In a process of its own: other tests compile kernels in this one.
-WARM_UP = """
+COUNT = """
 from collections import Counter
 import gc
 import json
 import sys
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
-from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.offline.replay import Replay
-from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 
 def kernels():
     # A CFunc is a kernel that is called by address.
@@ -219,7 +215,14 @@ def kernels():
         if function.__module__.startswith('rs_relpose_ros'):
             kernels[f'{function.__module__}.{function.__name__}'] += count
     return kernels
-
+"""
+WARM_UP = (
+    COUNT
+    + """
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.offline.replay import Replay
+from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 
 parameters = read_parameters(sys.argv[2])
 warm_up_pipeline(parameters)
@@ -232,6 +235,33 @@ after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))
 """
+)
+# The same of a calibration, with a known and with an unknown lens.
+CALIBRATION = (
+    COUNT
+    + """
+import numpy as np
+from rs_relpose_lab.experiments.calibration_tracks import drawn, record
+from rs_relpose_ros.calibrate.procedure import calibrate, warm_up_fit
+from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+
+warm_up_fit()
+before = kernels()
+rng = np.random.default_rng(1)
+truth = drawn(rng, readout_time=0.02, frames=60)
+recorded = record(truth, rng)
+camera = RollingShutterCamera(
+    width=truth.width, height=truth.height, fx=truth.focal, fy=truth.focal,
+    cx=0.5 * truth.width, cy=0.5 * truth.height, distortion=(1e-3, 0.0, 0.0, 0.0, 0.0),
+    readout_time=0.0)
+for focal_known in (True, False):
+    calibrate(recorded.tracks, recorded.gyro, camera, focal_known=focal_known,
+              config=TRACKED_IN_IMAGES)
+after = kernels()
+print(json.dumps([[k for k in after if after[k] != before[k]], sum(before.values())]))
+"""
+)
 
 
 @pytest.mark.timeout(600)
@@ -241,5 +271,12 @@ def test_nothing_is_compiled_after_the_warm_up(bundled_bag):
     )
     # The bag holds motion, standstill and pure rotation: every path of the estimator.
     assert {'OK', 'PURE_ROTATION'} <= set(statuses)
+    assert kernels > 5
+    assert compiled_late == []
+
+
+@pytest.mark.timeout(600)
+def test_nothing_is_compiled_after_the_warm_up_of_a_calibration():
+    compiled_late, kernels = json.loads(output(CALIBRATION, cwd=ROOT, timeout=590))
     assert kernels > 5
     assert compiled_late == []

@@ -212,14 +212,22 @@ def warm_up_fit() -> None:
     )
     gyro_ns = np.arange(-100, 500) * to_nanoseconds(5e-3)
     camera = RollingShutterCamera(
-        width=200, height=200, fx=150.0, fy=150.0, cx=100.0, cy=100.0, readout_time=0.0
+        width=200,
+        height=200,
+        fx=150.0,
+        fy=150.0,
+        cx=100.0,
+        cy=100.0,
+        distortion=(1e-3, 0.0, 0.0, 0.0),
+        readout_time=0.0,
     )
     data = Observations.of(tracks, GyroSeries(gyro_ns, rng.normal(size=(600, 3))), camera)
     data.image_rates(data.pairs(_NEIGHBOURS, rng))
     problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
     begin = fit.initial(problem, np.eye(3), 0.0)
-    every = np.ones(model.GLOBAL, dtype=bool)
-    errors.fit(fit.with_bends(problem, begin), begin, every, rounds=1)
+    some = OFFLINE.mask('axes', 'readout_time')
+    found = errors.fit(fit.with_bends(problem, begin), begin, some, rounds=1)
+    errors.widened(found, errors.doubts(camera.width, lens_known=True))
 
 
 def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tuple[fit.Fit, bool]:

@@ -64,7 +64,9 @@ class Pair(NamedTuple):
 
 def frames_of(pairs: Sequence[Pair]) -> NDArray[np.int64]:
     """Frames (2, P) of pairs."""
-    return np.array([pair[:2] for pair in pairs], dtype=np.int64).reshape(-1, 2).T
+    frames = np.array([pair[:2] for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    # A transposed index makes transposed times, which compile the kernels a second time.
+    return np.ascontiguousarray(frames.T)
 
 
 class PairSelection(NamedTuple):
