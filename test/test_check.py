@@ -570,6 +570,7 @@ def found_by(row, direction, exposure, offset_observable=True):
         frame_interval=INTERVAL,
         quat_cam_imu_xyzw=TRUE['quat_cam_imu_xyzw'],
         readout_time=Estimate(signed, 3e-4, True),
+        readout_direction=direction,
         time_offset=Estimate(row_0, 2e-4, offset_observable),
     )
 

@@ -143,6 +143,16 @@ def test_rotation_for_display_is_not_applied(tmp_path):
             (0.01525, 'up'),
             'Reported by the file',
         ),
+        (
+            {'frame_readout_time': 15.25, 'frame_readout_direction': 'LeftToRight'},
+            (0.01525, 'right'),
+            'Reported by the file',
+        ),
+        (
+            {'frame_readout_time': 15.25, 'frame_readout_direction': 'RightToLeft'},
+            (0.01525, 'left'),
+            'Reported by the file',
+        ),
     ],
 )
 def test_readout_time_of_a_video(tmp_path, capsys, header, expected, source):
@@ -303,12 +313,6 @@ def frames_overwritten(folder: Path) -> Path:
         (
             lambda folder: made.make_clip(folder, {'EISE': 'N'}, whole=False),
             'telemetry-parser cannot read it',
-        ),
-        (
-            lambda folder: made.make_video(
-                folder, frame_readout_time=15.25, frame_readout_direction='LeftToRight'
-            ),
-            'column by column',
         ),
         (cut_in_half, 'clip.mp4'),
         (frames_overwritten, 'clip.mp4'),

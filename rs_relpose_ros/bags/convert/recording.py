@@ -18,7 +18,7 @@ from rs_relpose_ros.bags.convert.text_files import check_file
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import readout_direction, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import END_OF_STAMPS_NS, NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import outgoing
@@ -206,20 +206,23 @@ BY_COLUMNS_MS = 10_000.0
 _LONGEST_READOUT_MS = 1000.0
 
 
-def readout_values(milliseconds: float, name: str, source: str) -> list[SourcedValue]:
+def readout_values(
+    milliseconds: float, name: str, source: str, axis: int = 1
+) -> list[SourcedValue]:
     """Return the parameters of a readout time [ms], which is negative if the last row is first.
 
-    There are none for 0: the file does not know it. InputError, with `name`, for a sensor that
-    is read by columns. `source` describes where the value comes from.
+    There are none for 0: the file does not know it. `axis` is the pixel coordinate that is the
+    row, 0 for columns. InputError, with `name`, for columns without a direction. `source`
+    describes where the value comes from.
     """
     if abs(milliseconds) >= BY_COLUMNS_MS:
         raise InputError(
-            f'{name}: the sensor is read column by column, which the model of row '
-            'times does not cover'
+            f'{name}: the sensor is read column by column, in a direction that the file does not '
+            'state'
         )
     if not 0.0 < abs(milliseconds) < _LONGEST_READOUT_MS:
         return []
-    direction = 'down' if milliseconds > 0.0 else 'up'
+    direction = readout_direction(axis, milliseconds)
     return [
         SourcedValue('readout_time', round(abs(milliseconds) * 1e-3, 9), source),
         SourcedValue('readout_direction', direction, 'As the readout time.'),

@@ -6,7 +6,6 @@ Formats: docs/recordings.md. Lens profiles are those of Gyroflow.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -193,8 +192,8 @@ _READOUTS = (
 )
 # A .gcsv has the direction separately; of its four values these are rows upwards, and columns.
 _UPWARDS = ('1', '180', 'BottomToTop')
-# Values that mean columns read one by one: no readout time is taken from them.
-_COLUMNS = ('2', '270', 'LeftToRight', '3', '90', 'RightToLeft')
+_RIGHTWARDS = ('2', '270', 'LeftToRight')
+_LEFTWARDS = ('3', '90', 'RightToLeft')
 
 # Group and tag of stabilisation, its values without it, its name, and the switch of the camera.
 _STABILISATION = (
@@ -302,11 +301,11 @@ def _readout(tags: Sequence[Mapping[str, Any]]) -> list[SourcedValue]:
             except (TypeError, ValueError):
                 continue
             direction = str(fields.get('frame_readout_direction', ''))
-            if direction in _COLUMNS:
-                milliseconds = math.inf
-            elif direction in _UPWARDS:
+            if direction in (*_UPWARDS, *_LEFTWARDS):
                 milliseconds = -milliseconds
-            readout = readout_values(milliseconds, source, f'Reported by the file: {source}.')
+            axis = 0 if direction in (*_RIGHTWARDS, *_LEFTWARDS) else 1
+            described = f'Reported by the file: {source}.'
+            readout = readout_values(milliseconds, source, described, axis)
             if readout:
                 return readout
     return []
