@@ -39,11 +39,11 @@ from rs_relpose_ros.odometry.noise import (
 # 1 sigma of the velocity of a body at rest [m/s], per axis. A smaller one holds a body that
 # creeps; a larger one lets the path drift at rest. [chosen: 2 to 10 mm/s: a hand that holds still]
 _REST_VELOCITY_SIGMA = 0.005
-# Largest 1 sigma of the motion between two keyframes [m], as the IMU knows it, with which images
-# without translation are a camera that stays in place. With a larger one, the IMU could not tell a
-# camera that walks from one at rest, if an object fills the view.
-# [chosen: 0.03 to 0.2 would do: a walk moves by 0.2 m between keyframes]
-_STILL_SIGMA = 0.1
+# Largest 1 sigma of the speed between two keyframes [m/s], as the IMU knows it, with which images
+# without translation are a camera that stays in place. With a larger one the IMU could not tell a
+# walk from rest, if an object fills the view; with a smaller one a rotation just after the start
+# would not hold the path. [chosen: 0.3 to 0.7 would do: a walk has 1 to 1.8 m/s]
+_STILL_SPEED = 0.5
 # Largest chi squared per degree of freedom of that motion: above, the images show something that
 # moves with the camera. [derived: one in 130 by chance with 3 degrees of freedom]
 _STILL_GATE = 4.0
@@ -276,9 +276,10 @@ class KeyframeGraph:
         still = factors.still_factor(i, j, sigma, self._doubts)
         motion = self._innovation(step, still)
         largest_variance = np.linalg.norm(motion.covariance, 2)
-        known = sigma * math.sqrt(largest_variance)
+        assert step.interval is not None
+        speed_sigma = sigma * math.sqrt(largest_variance) / step.interval.duration
         agrees = motion.chi_squared <= _STILL_GATE
-        if at_rest or (agrees and known < _STILL_SIGMA):
+        if at_rest or (agrees and speed_sigma < _STILL_SPEED):
             graph.add(still)
 
     def _variance(
