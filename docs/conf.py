@@ -11,10 +11,14 @@ import sys
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
-manifest = (DOCS.parent / 'package.xml').read_text(encoding='utf-8')
+# rosdoc2 runs this text in a folder of its own, and sets the version itself.
+manifest = DOCS.parent / 'package.xml'
+found = manifest.is_file() and re.search(
+    r'<version>(.*?)</version>', manifest.read_text(encoding='utf-8')
+)
 project = 'rs_relpose_ros'
 project_copyright = 'rs_relpose_ros maintainers, Apache-2.0'
-release = version = re.search(r'<version>(.*?)</version>', manifest)[1]
+release = version = found[1] if found else ''
 
 # numpydoc is the better reader of these docstrings; napoleon comes with Sphinx.
 reader = 'numpydoc' if find_spec('numpydoc') else 'sphinx.ext.napoleon'
@@ -53,7 +57,7 @@ def without_links_to_files(app, docname, source):
         target = (DOCS / docname).parent / match[2]
         if target.resolve().is_relative_to(DOCS):
             return match[0]
-        return f'{match[1]} (`{target.resolve().relative_to(DOCS.parent)}`)'
+        return f'{match[1]} (`{match[2].replace("../", "")}`)'
 
     source[0] = OUTSIDE.sub(replaced, source[0])
 

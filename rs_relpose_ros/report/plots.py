@@ -185,17 +185,25 @@ def streams(observation: Observation) -> list[Drawing]:
 
 def _draw_steps(axis: Axes, times: Times, name: str, color: str, origin_ns: int) -> None:
     """Steps of one stream [ms], with the odd ones marked."""
-    stamps = times.stamps_ns[np.argsort(times.received_ns, kind='stable')]
-    at, steps = _seconds(stamps[1:], origin_ns), np.diff(stamps) * 1e-6
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
+    in_order = np.argsort(times.received_ns, kind='stable')
+    stamps = times.stamps_ns[in_order]
+    at = _seconds(stamps[1:], origin_ns)
+    steps = np.diff(stamps) * 1e-6
+    forwards = steps[steps > 0.0]
+    usual = float(np.median(forwards)) if len(forwards) else math.nan
     odd = (steps <= 0.0) | (steps > _GAP * usual)
+    # A step of hours must not flatten the others.
+    bounded = steps.clip(-5.0 * usual, 20.0 * usual)
     axis.plot(*thinned(at[~odd], steps[~odd]), '.', color=color, markersize=2.5)
-    axis.plot(*thinned(at[odd], steps[odd].clip(-5.0 * usual, 20.0 * usual)), 'x', color=RED)
+    axis.plot(*thinned(at[odd], bounded[odd]), 'x', color=RED)
     axis.set_ylabel(f'{name} [ms]')
-    rate = 1e3 / usual if usual > 0.0 else math.nan
-    text = f'{len(stamps)} messages, {rate:.4g} Hz, {int(odd.sum())} gaps or steps back'
-    axis.set_title(text, loc='left')
-    axis.set_ylim(bottom=min(0.0, float(axis.get_ylim()[0])))
+    rate = 1e3 / usual
+    count = int(odd.sum())
+    axis.set_title(
+        f'{len(stamps)} messages, {rate:.4g} Hz, {count} gaps or steps back', loc='left'
+    )
+    lowest, _ = axis.get_ylim()
+    axis.set_ylim(bottom=min(0.0, float(lowest)))
 
 
 def _legend(axis: Axes) -> None:
@@ -265,13 +273,15 @@ def _rests(gyro: Inertial, origin_ns: int) -> Iterable[tuple[float, float]]:
     if len(gyro.values) < 3:
         return
     at = _seconds(gyro.stamps_ns, origin_ns)
-    median = np.median(gyro.values, axis=0)
-    quiet = (np.abs(np.diff(gyro.values, axis=0)) < _REST_RATE).all(axis=1)
-    quiet &= np.linalg.norm(gyro.values[1:] - median, axis=1) < 3.0 * _REST_RATE
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(int)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if at[min(last, len(at) - 1)] - at[first] >= _REST_LENGTH:
-            yield float(at[first]), float(at[min(last, len(at) - 1)])
+    steps = np.abs(np.diff(gyro.values, axis=0))
+    from_median = np.linalg.norm(gyro.values[1:] - np.median(gyro.values, axis=0), axis=1)
+    quiet = (steps < _REST_RATE).all(axis=1) & (from_median < 3.0 * _REST_RATE)
+    enclosed = np.concatenate([[False], quiet, [False]])
+    edges = np.flatnonzero(np.diff(enclosed.astype(int)))
+    for first, after in zip(edges[::2], edges[1::2], strict=True):
+        begin, end = float(at[first]), float(at[min(after, len(at) - 1)])
+        if end - begin >= _REST_LENGTH:
+            yield begin, end
 
 
 def rates_of(observation: Observation) -> Rates | None:

@@ -60,9 +60,11 @@ def epipolar_residuals(pair: PairResult, focal_length: float) -> Array:
     ``|f_1 . (b x R f_2)|`` over the length of its gradient by both images.
     """
     pose, matches = pair.pose, pair.matches
-    first, second = matches.rays[0], matches.rays[-1] @ pose.R.T
+    first = matches.rays[0]
+    second = matches.rays[-1] @ pose.R.T
+    velocity_2 = pose.R @ pose.linear_velocity2
     moved_1 = np.outer(matches.row_times[0], pose.linear_velocity1)
-    moved_2 = np.outer(matches.row_times[-1], pose.R @ pose.linear_velocity2)
+    moved_2 = np.outer(matches.row_times[-1], velocity_2)
     baselines = pose.t + moved_2 - moved_1
     normal = np.cross(baselines, second)
     value = np.einsum('ij,ij->i', first, normal)
@@ -158,11 +160,14 @@ class Rates:
         if not len(self.ends):
             return np.empty(0), np.empty(0)
         first, last = float(self.ends[0]), float(self.ends[-1])
-        begins = np.arange(first, max(last - 0.5 * _PART, first) + 1e-9, _PART)
-        parts = [(begin, self.part(begin, begin + _PART)) for begin in begins]
-        found = [(begin, part.scan().best) for begin, part in parts if part.determines_offset]
-        middles = np.array([min(begin + 0.5 * _PART, last) for begin, _ in found])
-        return middles, np.array([offset for _, offset in found])
+        last_begin = max(last - 0.5 * _PART, first)
+        middles, offsets = list[float](), list[float]()
+        for begin in np.arange(first, last_begin + 1e-9, _PART):
+            part = self.part(begin, begin + _PART)
+            if part.determines_offset:
+                middles.append(min(begin + 0.5 * _PART, last))
+                offsets.append(part.scan().best)
+        return np.array(middles), np.array(offsets)
 
 
 def mean_rates(
