@@ -24,7 +24,7 @@ release = version = found[1] if found else ''
 reader = 'numpydoc' if find_spec('numpydoc') else 'sphinx.ext.napoleon'
 extensions = ['myst_parser', 'sphinx.ext.autodoc', reader]
 root_doc = 'index'
-exclude_patterns = ['_build', 'wrapped']
+exclude_patterns = ['_build', 'front.md']
 source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
 suppress_warnings = ['myst.strikethrough']
 
