@@ -20,12 +20,15 @@ from message_builders import damaged, WHOLE, with_other_fields
 import numpy as np
 import pytest
 from recorded_files import make_posecam, make_realsense, make_tables
+from test_convert_formats import CALIBRATIONS
+import yaml
 
 from rs_relpose_lab.datasets import read_realsense
 from rs_relpose_ros.bags.convert.android import read_posecam
 from rs_relpose_ros.bags.convert.phone import read_tables
 from rs_relpose_ros.bags.convert.recording import write_bag
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_calibration, read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -275,4 +278,64 @@ def test_damaged_recordings(tmp_path, count, make, reader):
             shutil.rmtree(tmp_path / 'bag', ignore_errors=True)
 
     outcomes = outcomes_of(attempt, count, st.sampled_from(list(contents)), edits)
+    assert outcomes['read'] and outcomes['refused']
+
+
+# --- parameter files and calibrations of other tools
+
+NAMES = (
+    *('/**', 'ros__parameters', 'readout_time', 'time_offset', 'quat_cam_imu_xyzw', 'data'),
+    *('cam0', 'T_cam_imu', 'T_imu_cam', 'intrinsics', 'distortion_coeffs', 'distortion_model'),
+    *('resolution', 'timeshift_cam_imu', 'imu0', 'gyroscope_noise_density', 'T_BS', 'rows'),
+    *('cols', 'image_width', 'Camera1.fx', 'IMU.T_b_c1', 'camera_model', 'camera_matrix'),
+)
+scalars = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.floats(),
+    st.text(max_size=8),
+    st.sampled_from(
+        ('pinhole', 'radtan', 'plumb_bob', 'nan', '.inf', '1e999', '!!python/name:os')
+    ),
+)
+documents = st.recursive(
+    scalars,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.lists(st.floats(-2.0, 2.0), min_size=4, max_size=16),
+        st.dictionaries(st.sampled_from(NAMES), inner, max_size=6),
+    ),
+    max_leaves=30,
+)
+KNOWN_FILES = (
+    *(text for text, _ in CALIBRATIONS.values()),
+    '/**:\n  ros__parameters:\n    readout_time: 0.03\n    time_offset: -0.01\n',
+)
+
+
+@pytest.mark.timeout(600)
+@share_and_all(150, 10_000, 1300)
+def test_parameter_files_and_calibrations(tmp_path, count):
+    path = tmp_path / 'file.yaml'
+
+    def attempt(which: int, changes: list[Any], document: Any) -> list[str]:
+        if which < len(KNOWN_FILES):
+            path.write_bytes(damaged(KNOWN_FILES[which].encode(), changes))
+        else:
+            path.write_text(yaml.safe_dump(document, allow_unicode=True))
+        outcomes = []
+        for reader in (read_parameters, read_calibration):
+            try:
+                reader(path)
+                outcomes.append('read')
+            except RsRelposeError as error:
+                check_text(error)
+                outcomes.append('refused')
+        return outcomes
+
+    for text in KNOWN_FILES:
+        path.write_text(text)
+        read_parameters(path)
+    outcomes = outcomes_of(attempt, count, st.integers(0, 2 * len(KNOWN_FILES)), edits, documents)
     assert outcomes['read'] and outcomes['refused']

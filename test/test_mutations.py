@@ -26,21 +26,16 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 LONGEST = 10.0
 # Exit codes that the documents state: done, failed, bad input.
 CODES = (0, 1, 2)
-# Bags for each command, of which `calibrate` gets the fewest: it takes the longest.
+# Bags for `check`, which runs the front end, too.
 BAGS = 2000
-CALIBRATED = 20  # one bag in so many
+# One bag in so many for the commands that take longer.
+REPLAYED = 3
+CALIBRATED = 20
 # Bags that one test reads, so that several processes of pytest share the work.
 PART = 250
 
 Messages = list[RawMessage]
 Change = Callable[[Messages, np.random.Generator], Messages]
-
-TYPES = {
-    'sensor_msgs/msg/Imu',
-    'sensor_msgs/msg/CameraInfo',
-    'sensor_msgs/msg/CompressedImage',
-    'geometry_msgs/msg/PoseStamped',
-}
 
 
 @pytest.fixture(scope='module')
@@ -51,9 +46,9 @@ def walk(tmp_path_factory) -> tuple[Messages, dict[str, Any], Path]:
         seed=3,
         duration=2.0,
         fps=8.0,
-        width=96,
-        height=72,
-        fx=70.0,
+        width=128,
+        height=96,
+        fx=90.0,
         imu_rate=80.0,
         plan='walk:2',
     )
@@ -217,10 +212,9 @@ def faults(
     given = ('--params', parameters)
     for seed in seeds:
         bag = write(mutated(messages, seed), topics, folder / 'bag')
-        commands: list[tuple[object, ...]] = [
-            ('check', bag, *given),
-            ('replay', bag, *given, '--no-pictures', '--out', folder / 'replay'),
-        ]
+        commands: list[tuple[object, ...]] = [('check', bag, *given)]
+        if seed % REPLAYED == 0:
+            commands.append(('replay', bag, *given, '--no-pictures', '--out', folder / 'replay'))
         if seed % CALIBRATED == 0:
             commands.append(('calibrate', bag, '--out', folder / 'calibrate'))
         for words in commands:
@@ -237,11 +231,12 @@ def test_mutated_bags_end_with_a_code_and_no_traceback(capsys, walk, tmp_path, f
     found, codes = faults(capsys, walk, tmp_path, range(first, first + PART))
     assert not found, '\n'.join(found)
     # Some mutations leave a bag that can be used, others do not.
-    assert min(codes['replay', 0], codes['replay', 2], codes['check', 1]) > 0.02 * PART
+    assert min(codes['check', 0], codes['check', 1], codes['replay', 2]) > 0.02 * PART
 
 
 def test_the_walk_itself_has_poses(capsys, walk, tmp_path):
     messages, topics, parameters = walk
     bag = write(messages, topics, tmp_path / 'bag')
     words = ('replay', bag, '--params', parameters, '--no-pictures', '--out', tmp_path / 'replay')
-    assert run(capsys, *words) == (0, '')
+    code, problem = run(capsys, *words)
+    assert (code, problem) == (0, ''), problem

@@ -139,7 +139,7 @@ def _text_of(path: Path) -> str:
     try:
         return path.read_text(encoding='utf-8')
     except UnicodeDecodeError as error:
-        raise InputError(f'{path} is not valid YAML: {error}') from error
+        raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -161,7 +161,7 @@ def _document(text: str, path: str) -> Any:
             raise InputError(f'{path} has YAML aliases, which are not supported')
         return yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f'{path} is not valid YAML: {error}') from error
+        raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
 
 
 def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
