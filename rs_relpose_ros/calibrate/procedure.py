@@ -75,7 +75,6 @@ def calibrate(
     camera: RollingShutterCamera,
     *,
     focal_known: bool = True,
-    lens_given: bool = False,
     config: CalibrationConfig | None = None,
     quat_prior: Sequence[float] | None = None,
     rng: np.random.Generator | int = 0,
@@ -87,25 +86,18 @@ def calibrate(
     from the camera's by at most ``config.max_time_offset``; the readout time of `camera` is not
     used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
     `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,
-    radial distortion (k1, k2, k3) and principal point are estimated; with `lens_given` about a
-    distortion that is given. Rows of the sensor are rows of the image, or columns where these fit
-    better for certain. `rng` selects matches if there are more than needed; `progress` is called
-    with the finished share of the work. InputError if the recording cannot be used, with what to
-    record instead.
+    radial distortion (k1, k2, k3) and principal point are estimated. Rows of the sensor are rows
+    of the image, or columns where these fit better for certain. `rng` selects matches if there are
+    more than needed; `progress` is called with the finished share of the work. InputError if the
+    recording cannot be used, with what to record instead.
     """
-    config = CalibrationConfig() if config is None else config
-    found = fitted(
-        tracks,
-        gyro,
-        camera,
-        config,
-        focal_known=focal_known,
-        lens_given=lens_given,
-        R_prior=rotation_of(quat_prior),
+    recording = CalibrationInput(tracks, gyro, camera, focal_known, {})
+    return recording.calibrated(
+        CalibrationConfig() if config is None else config,
+        quat_prior=quat_prior,
         rng=rng,
         progress=progress,
     )
-    return result_of(found, config, rotation_of(quat_prior))
 
 
 def rotation_of(quat_xyzw: Sequence[float] | None) -> Array | None:
@@ -130,18 +122,15 @@ def result_of(
 
 
 def fitted(
-    tracks: TrackedPoints,
-    gyro: GyroSeries,
-    camera: RollingShutterCamera,
+    recording: CalibrationInput,
     config: CalibrationConfig,
     *,
-    focal_known: bool,
-    lens_given: bool,
     R_prior: Array | None,
     rng: np.random.Generator | int = 0,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Fitted:
     """The fit of `calibrate`, before it is evaluated."""
+    tracks, gyro = recording.tracks, recording.gyro
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(
             f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
@@ -149,14 +138,14 @@ def fitted(
         )
 
     def about(lens: Array) -> Observations:
-        return Observations.of(tracks, gyro, camera, config, lens, lens_given)
+        return Observations.of(tracks, gyro, recording.camera, config, lens, recording.lens_given)
 
     data = about(np.zeros(N_LENS))
     _check_recording(data, config)
     progress(0.15)
 
     generator = np.random.default_rng(rng)
-    return _calibrated(about, data, R_prior, focal_known, config, generator, progress)
+    return _calibrated(about, data, R_prior, recording.focal_known, config, generator, progress)
 
 
 def _calibrated(
@@ -395,14 +384,18 @@ def calibrate_together(
                 'camera at one resolution together, others each alone'
             )
     R_prior, count = rotation_of(quat_prior), len(recordings)
-    found = [
-        recording.fitted(
-            config,
-            R_prior=R_prior,
-            progress=lambda share, k=k: progress((k + share) / count),
+    found: list[Fitted] = []
+    for recording in recordings:
+
+        def progress_of_all(share: float) -> None:
+            progress((len(found) + share) / count)
+
+        found.append(fitted(recording, config, R_prior=R_prior, progress=progress_of_all))
+    if len({one.data.camera.readout_axis for one in found}) > 1:
+        raise InputError(
+            'the images of some recordings are turned against those of others, rows against '
+            'columns: calibrate bags of one orientation together, others each alone'
         )
-        for k, recording in enumerate(recordings)
-    ]
     fits = [one.final for one in found]
     reference = int(np.argmax([one.problem.begin[-1] for one in fits]))
     lenses = np.array([one.data.lens for one in found])
@@ -722,29 +715,18 @@ class CalibrationInput:
     is_whole: bool = True  # whether the images show the whole sensor, without binning
     lens_given: bool = False  # whether the distortion is that of a CameraInfo, yet estimated
 
-    def calibrated(self, config: CalibrationConfig, **options: Any) -> CalibrationResult:
-        """Its calibration; `options` of `calibrate`."""
-        return calibrate(
-            self.tracks,
-            self.gyro,
-            self.camera,
-            focal_known=self.focal_known,
-            lens_given=self.lens_given,
-            config=config,
-            **options,
-        )
-
-    def fitted(self, config: CalibrationConfig, **options: Any) -> Fitted:
-        """Its fit; `options` of `fitted`."""
-        return fitted(
-            self.tracks,
-            self.gyro,
-            self.camera,
-            config,
-            focal_known=self.focal_known,
-            lens_given=self.lens_given,
-            **options,
-        )
+    def calibrated(
+        self,
+        config: CalibrationConfig,
+        *,
+        quat_prior: Sequence[float] | None = None,
+        rng: np.random.Generator | int = 0,
+        progress: Callable[[float], object] = lambda share: None,
+    ) -> CalibrationResult:
+        """Its calibration, as by `calibrate`."""
+        R_prior = rotation_of(quat_prior)
+        found = fitted(self, config, R_prior=R_prior, rng=rng, progress=progress)
+        return result_of(found, config, R_prior)
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
         """The same for a lens that is to be estimated, about the distortion of its CameraInfo.
