@@ -527,7 +527,7 @@ class Bag:
 
 # Types of the sensors whose clocks decide the order of reading. [derived: `reading_times`]
 _IMAGES = (IMAGE, COMPRESSED_IMAGE)
-_MEASURED = (*_IMAGES, IMU)
+_MEASURED = (*_IMAGES, IMU)  # images and IMU; CameraInfo has no clock of its own
 # Smallest offset of the clocks [s] that changes the order of reading: within less the history of
 # the IMU has the samples of an image anyhow. [chosen: below its 5 s, above delays of drivers]
 _LEAST_OFFSET = 1.0

@@ -57,30 +57,30 @@ MOST_ACCELERATIONS = 3
 # reference row, the derivatives of both pixel coordinates by the ray [px], s [s], S(s) [m], and
 # the derivative of S by s [m/s].
 _OBSERVATION = first_indices(ray=3, to_pixels=6, time=1, moved=3, moving=3)
-RAY = _OBSERVATION['ray']
-TO_PIXELS = _OBSERVATION['to_pixels']
-TIME = _OBSERVATION['time']
-MOVED = _OBSERVATION['moved']
-MOVING = _OBSERVATION['moving']
-VALUES = _OBSERVATION['end']
+RAY = _OBSERVATION['ray']  # unit vector, axes of the reference row
+TO_PIXELS = _OBSERVATION['to_pixels']  # derivatives of both pixel coordinates by the ray [px]
+TIME = _OBSERVATION['time']  # s, the time of the row [s]
+MOVED = _OBSERVATION['moved']  # S(s), the place of the camera [m]
+MOVING = _OBSERVATION['moving']  # derivative of S by s [m/s]
+VALUES = _OBSERVATION['end']  # number of rows of an observation
 
 # First row of each value of a track in its block: f, two vectors across the ray of frame 1, along
 # which f moves, and rho times the length of f.
 _TRACK = first_indices(direction=3, columns=6, inverse_distance=1)
-DIRECTION = _TRACK['direction']
-COLUMNS = _TRACK['columns']
-INVERSE_DISTANCE = _TRACK['inverse_distance']
-TRACK_VALUES = _TRACK['end']
+DIRECTION = _TRACK['direction']  # f
+COLUMNS = _TRACK['columns']  # the vectors along which f moves
+INVERSE_DISTANCE = _TRACK['inverse_distance']  # rho times the length of f
+TRACK_VALUES = _TRACK['end']  # number of rows of a track
 # Unknowns of a track: two steps of its direction, and its inverse distance.
 TRACK_UNKNOWNS = 3
 
 # First unknown of the path: two steps of t in its tangent plane, log k, b, and e_0, e_1, ...; the
 # phi of the frames 1, 2, ... follow after them.
 _UNKNOWNS = first_indices(tangent=2, log_scale=1, bias=3, acceleration=3 * MOST_ACCELERATIONS)
-TANGENT = _UNKNOWNS['tangent']
-LOG_SCALE = _UNKNOWNS['log_scale']
-BIAS = _UNKNOWNS['bias']
-ACCELERATION = _UNKNOWNS['acceleration']
+TANGENT = _UNKNOWNS['tangent']  # steps of t
+LOG_SCALE = _UNKNOWNS['log_scale']  # log k
+BIAS = _UNKNOWNS['bias']  # b
+ACCELERATION = _UNKNOWNS['acceleration']  # e_0, e_1, ...
 
 # First row of an observation's derivatives: by the unknowns of its track, the residual itself, by
 # phi of its frame, by the path, and by the place p(s).
@@ -91,11 +91,11 @@ _ROWS = first_indices(
     path=_UNKNOWNS['end'],
     place=3,
 )
-RESIDUAL = _ROWS['residual']
-PHI = _ROWS['phi']
-PATH = _ROWS['path']
-PLACE = _ROWS['place']
-ROWS = _ROWS['end']
+RESIDUAL = _ROWS['residual']  # the residual [px]
+PHI = _ROWS['phi']  # by phi of the frame
+PATH = _ROWS['path']  # by the unknowns of the path
+PLACE = _ROWS['place']  # by the place p(s)
+ROWS = _ROWS['end']  # number of rows
 
 # Square of the sine of the parallax below which the distance of a track is not triangulated.
 # [chosen: 1e-4 rad, a tenth of a pixel; the adjustment finds the distance in any case]

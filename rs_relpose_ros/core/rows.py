@@ -32,17 +32,17 @@ from rs_relpose_ros.jit import inlined_kernel, kernel
 
 # Places of the deviations in the whole vector, as numbers for the kernels.
 _AXES = PARTS['axes'].start
-_OFFSET = PARTS['time_offset'].start
-_SLOPE = PARTS['offset_per_interval'].start
-_READOUT = PARTS['readout_time'].start
+_OFFSET = PARTS['time_offset'].start  # IMU's clock minus the camera's
+_SLOPE = PARTS['offset_per_interval'].start  # offset by the interval between frames
+_READOUT = PARTS['readout_time'].start  # signed readout time
 # Deviations of the rates of the gyro, which are neighbours in the whole vector: the first of
 # them, and their number.
 _GYRO = PARTS['gyro_bias'].start
-_N_GYRO = PARTS['exposure_square'].stop - _GYRO
+_N_GYRO = PARTS['exposure_square'].stop - _GYRO  # bias, scale, skew, exposure
 # Places among the deviations of the rates.
 _SCALE = PARTS['gyro_scale'].start - _GYRO
-_SKEW = PARTS['gyro_skew'].start - _GYRO
-_EXPOSURE = PARTS['exposure_square'].start - _GYRO
+_SKEW = PARTS['gyro_skew'].start - _GYRO  # first of three
+_EXPOSURE = PARTS['exposure_square'].start - _GYRO  # square of the exposure
 # Pairs of axes of `gyro_skew`, in its order.
 _SKEWED = ((1, 2), (0, 2), (0, 1))
 

@@ -112,6 +112,7 @@ _WRONG_STARTS = 3
 # doubt: pairs that are wrong together, as of a moving object, look like wrong axes.
 # [measured: docs/lab/odometry.md, "Disturbances": with 20 the object loses no path]
 _PROVEN = 20
+# Reason of a start that fails by its own data, for the status of the node.
 _CONTRADICTION = (
     'pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
     'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?'
@@ -124,6 +125,7 @@ _LONGEST_START = 8.0
 _UNSOLVED_FIX = (
     'check the sigmas and noise densities of the parameter file, and report it with the recording'
 )
+# Reason of a path that ends where samples of the IMU are missing.
 _GAP = 'the IMU has a gap, or its clock jumped: see its driver'
 # Fewest pairs that determine the scale of a start in motion. [derived: velocity, tilt and bias are
 # nine unknowns, a pair has five equations; four pairs have some left to contradict]

@@ -24,9 +24,9 @@ Ints = NDArray[np.int64]
 
 # The rows of an image whose poses a model has: indices into axis 1 of `Model.R`.
 MODEL_ROWS = ('start', 'middle', 'end')
-START = MODEL_ROWS.index('start')
-MIDDLE = MODEL_ROWS.index('middle')
-END = MODEL_ROWS.index('end')
+START = MODEL_ROWS.index('start')  # the row that is read first
+MIDDLE = MODEL_ROWS.index('middle')  # the middle row
+END = MODEL_ROWS.index('end')  # the row that is read last
 # From OpenGL's camera axes (x right, y up, z backward) to those of OpenCV.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # OpenCV counts pixels from the centre of the first one, all formats here from its corner.

@@ -75,15 +75,15 @@ _OF_SECOND = np.r_[factors.IMU['X2'], factors.IMU['V2'], factors.IMU['B2']]
 _OF_DOUBTS = slice(factors.IMU['B2'].stop, None)
 # Columns of the covariance of a keyframe; the vector of `doubts` follows.
 _KEYFRAME = slices({'pose': 6, 'velocity': 3, 'accel_bias': 3, 'gyro_bias': 3, 'arm': 3})
-POSE = _KEYFRAME['pose']
+POSE = _KEYFRAME['pose']  # both, rotation first
 # Rotation and translation of the pose.
 ROTATION = slice(0, 3)
-TRANSLATION = slice(3, 6)
-VELOCITY = _KEYFRAME['velocity']
-GYRO_BIAS = _KEYFRAME['gyro_bias']
-ARM = _KEYFRAME['arm']
-BIAS = slice(_KEYFRAME['accel_bias'].start, GYRO_BIAS.stop)
-DOUBTS = slice(ARM.start, None)
+TRANSLATION = slice(3, 6)  # in the axes of the camera
+VELOCITY = _KEYFRAME['velocity']  # in the world
+GYRO_BIAS = _KEYFRAME['gyro_bias']  # in the axes of the IMU
+ARM = _KEYFRAME['arm']  # lever arm from the IMU to the camera, the first of `doubts`
+BIAS = slice(_KEYFRAME['accel_bias'].start, GYRO_BIAS.stop)  # of both sensors
+DOUBTS = slice(ARM.start, None)  # lever arm and deviations
 # Unknowns of a keyframe without `doubts`.
 _OWN = slice(0, ARM.start)
 

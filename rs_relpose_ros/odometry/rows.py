@@ -30,15 +30,17 @@ from rs_relpose_ros.imu.integration import force_integrals
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.output_files import written
 
+# Name of the file that `RowTrajectory` writes and reads, part of the public interface.
 ROWS_FILE = 'trajectory_rows.npz'
 
 Stamps = NDArray[np.int64]
 
-CAMERA = 'camera'
-IMU = 'imu'
-BASE = 'base'
+CAMERA = 'camera'  # optical axes of the camera
+IMU = 'imu'  # axes of the IMU
+BASE = 'base'  # `base_frame`, the robot
+# Frames whose poses a trajectory gives.
 FRAMES = (CAMERA, IMU, BASE)
-_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])
+_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY])  # of the world, z up [m/s^2]
 # Columns of the samples of a trajectory, in the order of `RowTrajectory`.
 _Columns = tuple[Stamps, Array, Array, Array, Array]
 

@@ -10,10 +10,11 @@ from rs_relpose_ros.calibration import findings_text
 from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.calibration.findings_text import Text
 
+# Short names of the states, which each line of a report has.
 OK = FindingState.OK
-UNKNOWN = FindingState.UNKNOWN
-SUSPECT = FindingState.SUSPECT
-WRONG = FindingState.WRONG
+UNKNOWN = FindingState.UNKNOWN  # not observable, or not measured
+SUSPECT = FindingState.SUSPECT  # a warning
+WRONG = FindingState.WRONG  # a failure
 
 
 class Line(NamedTuple):
@@ -87,6 +88,7 @@ _JOINT = frozenset(
         *(code for code in Code if not code.is_property),
     )
 )
+# The same with the clocks, which both streams have to share.
 _JOINT_AND_CLOCKS = _JOINT | {Code.CLOCKS}
 # What follows from a failure: its code, and those of the findings that it spoils. The first row
 # that applies counts, and a failure follows from those above it alone.

@@ -20,6 +20,7 @@ class FolderFormat(NamedTuple):
         return f'{self.name} ({", ".join(self.files)})'
 
 
+# Folders that `convert` reads, each with the files that tell it from the others.
 FORMATS = (
     FolderFormat('PoseCam', 'phone', ('poses.csv', 'imu.csv', 'frames')),
     FolderFormat('MARS Logger', 'phone', ('movie.mp4', 'frame_timestamps.txt', 'gyro_accel.csv')),

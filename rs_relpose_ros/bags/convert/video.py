@@ -192,8 +192,8 @@ _READOUTS = (
 )
 # A .gcsv has the direction separately; of its four values these are rows upwards, and columns.
 _UPWARDS = ('1', '180', 'BottomToTop')
-_RIGHTWARDS = ('2', '270', 'LeftToRight')
-_LEFTWARDS = ('3', '90', 'RightToLeft')
+_RIGHTWARDS = ('2', '270', 'LeftToRight')  # columns, the left one first
+_LEFTWARDS = ('3', '90', 'RightToLeft')  # columns, the right one first
 
 # Group and tag of stabilisation, its values without it, its name, and the switch of the camera.
 _STABILISATION = (
