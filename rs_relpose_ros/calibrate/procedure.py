@@ -399,7 +399,9 @@ def calibrate_together(
     fits = [one.final for one in found]
     reference = int(np.argmax([one.problem.begin[-1] for one in fits]))
     lenses = np.array([one.data.lens for one in found])
-    common = repeated.combined(fits, lenses, reference)
+    jitters = any(one.data.stamps.varying is observations.Varying.JITTER for one in found)
+    intervals = None if jitters else np.array([one.data.interval for one in found])
+    common = repeated.combined(fits, lenses, reference, intervals)
     result = result_of(found[reference]._replace(final=common.fit), config, R_prior)
     results = tuple(result_of(one, config, R_prior) for one in found)
     total = replace(

@@ -4,7 +4,8 @@ A parameter of recording i is ``theta_i = mu + u_i + e_i + M_i d``: u_i varies b
 with the variance T, e_i is the error of the fit with the covariance S_i, and d are the doubts of
 what is not estimated, which all recordings share. T is that of R. DerSimonian and N. Laird,
 Controlled Clinical Trials 7, 1986. The estimate is the weighted mean with ``(S_i + T)^-1``; its
-covariance is that for another recording of the camera, so that it contains T and the doubts.
+covariance is that for another recording of the camera, so that it contains T and the doubts, which
+are unknowns with a prior.
 """
 
 from collections.abc import Sequence
@@ -28,40 +29,116 @@ class Repeated(NamedTuple):
     between: Array  # (GLOBAL,) 1 sigma of the variation between recordings
 
 
-def combined(fits: Sequence[Fit], lenses: Array, reference: int) -> Repeated:
+class _Own(NamedTuple):
+    """What N recordings say, each of its own, about the common parameters."""
+
+    values: Array  # (N, GLOBAL)
+    scatters: Array  # (N, GLOBAL, GLOBAL) covariance of each without the doubts
+    # (N, GLOBAL, GLOBAL) the same by the Hessian, scaled: the scatter of few stretches of time has
+    # fewer dimensions than there are parameters, and no inverse.
+    shapes: Array
+    by_doubt: Array  # (N, GLOBAL, m)
+    free: Flags  # (N, GLOBAL) parameters that were fitted
+
+
+def combined(
+    fits: Sequence[Fit], lenses: Array, reference: int, intervals: Array | None = None
+) -> Repeated:
     """Combine at least two fits; `lenses` (N, 7) are the lenses about which each was fitted.
 
-    The parameters of the result are about the lens of fit `reference`. A prior counts in each
-    fit: it pulls the mean no more than it pulled one of them.
+    `intervals` (N,) are the median intervals between frames [s], at which the offset of each fit
+    is. The offset of the result is that at the interval of `reference`, and its lens is about that
+    of `reference`. A prior counts in each fit: it pulls the mean no more than it pulled one of
+    them.
     """
-    free = np.logical_or.reduce([one.free for one in fits])
     R_first = fits[0].unknowns.R_cam_imu
+    own = _own(fits, lenses, R_first)
+    if intervals is not None:
+        own = _at_interval(own, intervals[reference] - intervals)
+    free = np.asarray(own.free.any(axis=0))
+    between = _between(own)
+    # Normal equations of the parameters and the doubts, whose prior is their sigma of 1.
+    doubts = own.by_doubt.shape[2]
+    H, gradient = np.zeros((GLOBAL + doubts,) * 2), np.zeros(GLOBAL + doubts)
+    H[GLOBAL:, GLOBAL:] = np.eye(doubts)
+    gains = []
+    for value, shape, by_doubt, fitted in zip(
+        own.values, own.shapes, own.by_doubt, own.free, strict=True
+    ):
+        weight = np.zeros((GLOBAL, GLOBAL))
+        block = block_of(fitted)
+        weight[block] = np.linalg.inv((shape + between)[block])
+        design = np.hstack([np.eye(GLOBAL), by_doubt])
+        gains.append(design.T @ weight)
+        H += gains[-1] @ design
+        gradient += gains[-1] @ value
+    whole = block_of(np.append(free, np.ones(doubts, dtype=bool)))
+    inverse = np.zeros_like(H)
+    inverse[whole] = np.linalg.inv(H[whole])
+    shares = (inverse @ gains)[:, :GLOBAL]
+    scatter = (shares @ (own.scatters + between) @ shares.transpose(0, 2, 1)).sum(axis=0)
+    by_doubt = inverse[:GLOBAL, GLOBAL:]
+    covariance = scatter + by_doubt @ by_doubt.T + between
+    mean = (inverse @ gradient)[:GLOBAL]
+    return Repeated(
+        _moved(fits[reference], mean, R_first, lenses[reference], covariance, free),
+        np.sqrt(np.diag(between)),
+    )
+
+
+def _own(fits: Sequence[Fit], lenses: Array, R_first: Array) -> _Own:
+    """Parameters of all fits about one lens and one rotation."""
     values = np.array([one.unknowns.parameters for one in fits])
     values[:, model.LENS] += lenses
     for value, one in zip(values, fits, strict=True):
         turn = one.unknowns.R_cam_imu @ R_first.T
         value[ROTATION] = log_so3(np.ascontiguousarray(turn))
-    scatters = [one.covariance - one.by_doubt @ one.by_doubt.T for one in fits]
-    between = np.zeros(GLOBAL)
-    for k in np.flatnonzero(free):
-        in_fits = [i for i, one in enumerate(fits) if one.free[k]]
-        variances = np.array([scatters[i][k, k] for i in in_fits])
-        between[k] = _variance_between(values[in_fits, k], variances)
-    weights = np.zeros((len(fits), GLOBAL, GLOBAL))
-    for weight, scatter, one in zip(weights, scatters, fits, strict=True):
-        own = block_of(one.free)
-        weight[own] = np.linalg.inv((scatter + np.diag(between))[own])
-    whole = block_of(free)
-    covariance = np.zeros((GLOBAL, GLOBAL))
-    covariance[whole] = np.linalg.inv(weights.sum(axis=0)[whole])
-    shares = covariance @ weights
-    mean = np.einsum('nij,nj->i', shares, values)
-    by_doubt = sum(share @ one.by_doubt for share, one in zip(shares, fits, strict=True))
-    covariance += np.diag(between) + by_doubt @ by_doubt.T
-    return Repeated(
-        _moved(fits[reference], mean, R_first, lenses[reference], covariance, free),
-        np.sqrt(between),
+    scatters = np.array([one.covariance - one.by_doubt @ one.by_doubt.T for one in fits])
+    return _Own(
+        values,
+        scatters,
+        np.array([_shape(one, scatter) for one, scatter in zip(fits, scatters, strict=True)]),
+        np.array([one.by_doubt for one in fits]),
+        np.array([one.free for one in fits]),
     )
+
+
+def _shape(one: Fit, scatter: Array) -> Array:
+    """Inverse of the Hessian with the prior, scaled to the variances of the scatter."""
+    shape = np.zeros((GLOBAL, GLOBAL))
+    inverse = np.linalg.inv(one.information + one.problem.prior[one.block])
+    ratios = np.diag(scatter[one.block]) / np.diag(inverse)
+    shape[one.block] = float(np.median(ratios)) * inverse
+    return shape
+
+
+def _at_interval(own: _Own, longer: Array) -> _Own:
+    """The offsets at intervals that are `longer` (N,) [s]."""
+    moved = np.tile(np.eye(GLOBAL), (len(longer), 1, 1))
+    moved[:, model.OFFSET, model.SLOPE] = longer
+    return own._replace(
+        values=np.einsum('nij,nj->ni', moved, own.values),
+        scatters=moved @ own.scatters @ moved.transpose(0, 2, 1),
+        shapes=moved @ own.shapes @ moved.transpose(0, 2, 1),
+        by_doubt=moved @ own.by_doubt,
+    )
+
+
+def _between(own: _Own) -> Array:
+    """Covariance (GLOBAL, GLOBAL) of the variation between recordings."""
+    # Doubts move the fits of different motions differently, which is no variation.
+    apart = own.by_doubt - own.by_doubt.mean(axis=0)
+    covariances = own.shapes + apart @ apart.transpose(0, 2, 1)
+    between = np.zeros((GLOBAL, GLOBAL))
+    of_lens = np.arange(GLOBAL) >= model.LENS.start
+    for k in np.flatnonzero(own.free.any(axis=0) & ~of_lens):
+        some = own.free[:, k]
+        between[k, k] = _variance_between(own.values[some, k], covariances[some, k, k])
+    places = np.flatnonzero(own.free.all(axis=0) & of_lens)
+    lens = np.ix_(places, places)
+    own_lenses = np.array([covariance[lens] for covariance in covariances])
+    between[lens] = _lens_between(own.values[:, places], own_lenses)
+    return between
 
 
 def _moved(
@@ -77,6 +154,22 @@ def _moved(
     own = np.where(np.outer(fit.free, fit.free), covariance, 0.0)
     unknowns = fit.unknowns._replace(parameters=parameters, R_cam_imu=turn @ R_first)
     return replace(fit, unknowns=unknowns, covariance=own)
+
+
+def _lens_between(values: Array, covariances: Array) -> Array:
+    """Covariance (m, m) between recordings of m values (N, m) of the lens.
+
+    Errors of focal length, coefficients and principal point are correlated: the variation has the
+    shape of the errors of a fit, and single variances would take it apart.
+    """
+    count, size = values.shape
+    if not size:
+        return np.zeros((0, 0))
+    weights = np.linalg.inv(covariances)
+    typical = np.linalg.inv(weights.mean(axis=0))
+    off = values - typical @ np.einsum('nij,nj->i', weights, values) / count
+    ratio = float(np.einsum('ni,nij,nj->', off, weights, off)) / ((count - 1) * size)
+    return np.asarray(max(ratio - 1.0, 0.0) * typical)
 
 
 def _variance_between(values: Array, variances: Array) -> float:
