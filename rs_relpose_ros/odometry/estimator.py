@@ -109,7 +109,8 @@ _GROSS = 5.0
 # [chosen: 2 to 5 would do]
 _WRONG_STARTS = 3
 # Number of pairs that agree after a start, in motion, after which axes of the IMU are not in
-# doubt: pairs that are wrong together, as of a moving object, look like wrong axes.
+# doubt: pairs that are wrong together, as of a moving object, look like wrong axes. Until then
+# images without translation hold the camera in its place even if the velocity contradicts them.
 # [measured: docs/lab/odometry.md, "Disturbances": with 20 the object loses no path]
 _PROVEN = 20
 # Reason of a start that fails by its own data, for the status of the node.
@@ -506,7 +507,14 @@ class OdometryEstimator:
         gated = run.published or run.continued or pair.is_pure_rotation
         gate = _CONTRADICTING if gated else math.inf
         at_rest = pair.is_pure_rotation and interval.at_rest
-        innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED, gate=gate)
+        innovation = run.graph.add(
+            interval,
+            pair,
+            at_rest,
+            inflation=_SHARED,
+            gate=gate,
+            proven=run.confirmed >= _PROVEN,
+        )
         self._find(run, interval, at_ns)
         run.stamps.append((pair.stamp_ns, at_ns))
         run.intervals.append(interval.duration)

@@ -228,10 +228,12 @@ class KeyframeGraph:
         *,
         inflation: float = 1.0,
         gate: float = math.inf,
+        proven: bool = False,
     ) -> float:
         """Add a keyframe after `interval`, and the pair with the previous one, if any.
 
-        `at_rest`: whether images and IMU both are. `inflation`: of the pair's covariance. Returns
+        `at_rest`: whether images and IMU both are. `proven`: whether enough pairs agree with the
+        path, so that its velocity may contradict images without translation. `inflation`: of the pair's covariance. Returns
         the innovation of the pair: its chi squared per degree of freedom before it is used,
         without `inflation`; 0 without information. A pair above `gate` is not used; with a gate,
         its covariance is larger by an innovation above 1, too.
@@ -254,7 +256,7 @@ class KeyframeGraph:
                 sigma = math.sqrt(inflation * self._variance(innovation, gate))
                 graph.add(factors.pair_factor(i, j, pair, self._doubts, motions, sigma))
                 if pair.is_pure_rotation:
-                    self._hold_still(graph, step, at_rest)
+                    self._hold_still(graph, step, at_rest or not proven)
         if at_rest and innovation <= gate:
             at_zero = factors.diagonal([_REST_VELOCITY_SIGMA] * 3)
             for key in (V(i), V(j)):
@@ -265,11 +267,11 @@ class KeyframeGraph:
         self._update(graph, values, j, self._seconds + lasting, steps)
         return innovation
 
-    def _hold_still(self, graph: Any, step: _Step, at_rest: bool) -> None:
-        """Hold the camera in its place, if the IMU knows that it hardly moves.
+    def _hold_still(self, graph: Any, step: _Step, certain: bool) -> None:
+        """Hold the camera in its place if this is `certain`, or if the IMU knows that it stays.
 
         Images without translation alone do not show it: an object that moves with the camera may
-        fill the view.
+        fill the view. Just after a start they are better than the velocity of the path.
         """
         i, j = self._count - 1, self._count
         sigma = self._config.pure_rotation_motion
@@ -279,7 +281,7 @@ class KeyframeGraph:
         assert step.interval is not None
         speed_sigma = sigma * math.sqrt(largest_variance) / step.interval.duration
         agrees = motion.chi_squared <= _STILL_GATE
-        if at_rest or (agrees and speed_sigma < _STILL_SPEED):
+        if certain or (agrees and speed_sigma < _STILL_SPEED):
             graph.add(still)
 
     def _variance(
