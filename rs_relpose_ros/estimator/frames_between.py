@@ -124,12 +124,23 @@ def refined(
     changes = _changes_by(LIVE, path)
     if changes is None:
         return refined_pose
+    by_deviation = _pose_by_deviation(adjusted, tracks, priors, changes)
+    return replace(refined_pose, by_deviation=by_deviation)
+
+
+def _pose_by_deviation(
+    adjusted: Adjusted,
+    tracks: TrackBlocks,
+    priors: PathPriors,
+    changes: Changes,
+) -> Array:
+    """Derivative (6, D) of the pose from all frames by the deviations of `changes`."""
     # The noise of the fit, with the error that residuals do not show.
     noise = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
-    moved = adjustment.path_by_deviations(tracks, priors, state, noise, changes)
+    moved = adjustment.path_by_deviations(tracks, priors, adjusted.state, noise, changes)
     by_deviation = _pose_by_path(adjusted, tracks) @ moved
     by_deviation[3:] += changes.rotations[-1]
-    return replace(refined_pose, by_deviation=by_deviation)
+    return by_deviation
 
 
 def _with_inliers(

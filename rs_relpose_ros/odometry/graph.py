@@ -233,9 +233,9 @@ class KeyframeGraph:
         """Add a keyframe after `interval`, and the pair with the previous one, if any.
 
         `at_rest`: whether images and IMU both are. `proven`: whether enough pairs agree with the
-        path, so that its velocity may contradict images without translation. `inflation`: of the pair's covariance. Returns
-        the innovation of the pair: its chi squared per degree of freedom before it is used,
-        without `inflation`; 0 without information. A pair above `gate` is not used; with a gate,
+        path, so that its velocity may contradict images without translation. `inflation`: of the
+        pair's covariance. Returns the innovation of the pair: its chi squared per degree of
+        freedom before it is used, without `inflation`; 0 without information. A pair above `gate` is not used; with a gate,
         its covariance is larger by an innovation above 1, too.
         """
         i, j = self._count - 1, self._count
