@@ -235,8 +235,8 @@ class KeyframeGraph:
         `at_rest`: whether images and IMU both are. `proven`: whether enough pairs agree with the
         path, so that its velocity may contradict images without translation. `inflation`: of the
         pair's covariance. Returns the innovation of the pair: its chi squared per degree of
-        freedom before it is used, without `inflation`; 0 without information. A pair above `gate` is not used; with a gate,
-        its covariance is larger by an innovation above 1, too.
+        freedom before it is used, without `inflation`; 0 without information. A pair above `gate`
+        is not used; with a gate, its covariance is larger by an innovation above 1, too.
         """
         i, j = self._count - 1, self._count
         step = self._predicted(interval)

@@ -432,7 +432,7 @@ _SLOW_IMU = 80.0
 # would pass a scale that spoils baselines, a narrower one would report strong motion.
 # [chosen: gravity - 0.4 to gravity + 1, as mean lengths grow with acceleration]
 _LEAST_FORCE = 9.4
-_MOST_FORCE = 10.8
+_MOST_FORCE = 10.8  # [m/s^2], the other end of this range
 # Median rate [rad/s] that neither a hand nor a drone reaches; degrees per second do.
 # [chosen: 5 to 20 would do]
 _FASTEST_MEDIAN = 8.0
@@ -628,14 +628,14 @@ _LARGEST_OFFSET = 1e5
 # Matches of a pair in the median below which there is no estimate, and below which they are few.
 # [chosen: a solver samples 9 or 11 matches, and an inlier ratio is never 1]
 _NO_MATCHES = 15
-_FEW_MATCHES = 30
+_FEW_MATCHES = 30  # twice as many: a warning
 # Readout time [s] that is assumed where none is known, for the effect alone.
 # [chosen: between phones, 10 to 20 ms, and webcams, 30 to 60 ms]
 _EXAMPLE_READOUT = 0.030
 # Displacement [px] that is below the noise of matches, and one that spoils a global-shutter pose.
 # [chosen: about 2 and 8 sigmas of a match of 0.5 px]
 _NO_EFFECT = 1.0
-_STRONG_EFFECT = 4.0
+_STRONG_EFFECT = 4.0  # [px], the pose of a global shutter is spoiled
 # Sigmas beyond which a deviation is certain, whether it matters for poses or not. Fewer would make
 # false alarms of seven quantities common, more would hide deviations that are plain to see.
 # [chosen: 4 sigmas are exceeded by chance once in 16,000; 3.5 to 5 would do]
@@ -643,7 +643,9 @@ _CERTAIN = 4.0
 # Multiple of the largest sigma of an observable deviation from which poses are wrong.
 # [chosen: 2 to 5 would do]
 _GROSS = 3.0
+# What to do about a readout time that is assumed or off.
 _MEASURE = 'measure it with "rs_relpose calibrate"'
+# Findings that a calibration of the readout time settles.
 _READOUT = frozenset((Code.READOUT_TIME, Code.READOUT_DIRECTION))
 # Quantities by the parameters that set them.
 _SET_BY = {'quat_cam_imu_xyzw': Code.AXES, 'readout_time': Code.READOUT_TIME}

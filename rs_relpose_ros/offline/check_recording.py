@@ -181,7 +181,7 @@ class Scan:
 # times 10 s at 30 Hz. Shorter parts have too few pairs to settle, more parts cost time.
 # [chosen: 2 to 5 parts of 200 to 600 images would do]
 _PARTS = 3
-_PART_IMAGES = 300
+_PART_IMAGES = 300  # images of a part
 # Number of images of a calibration. Fewer leave quantities unobserved, more cost time.
 # [chosen: 20 s at 30 Hz; docs/calibration.md recommends 20 to 60 s]
 _CALIBRATED_IMAGES = 600
@@ -207,7 +207,7 @@ _CERTAIN = 4.0
 # Least angle [rad] and time [s] of such a contradiction: smaller ones the monitor measures better.
 # [chosen: above the errors of a calibration of 20 s, below the reach of the monitor]
 _LEAST_ANGLE = math.radians(5.0)
-_LEAST_TIME = 8e-3
+_LEAST_TIME = 8e-3  # [s]
 
 
 class Completion(NamedTuple):

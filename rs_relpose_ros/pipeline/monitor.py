@@ -23,11 +23,24 @@ from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
 
-# Frames by which clocks are compared, and latest pairs whose shift by a deviation is evaluated.
-_ARRIVALS, _EFFECTS = 20, 30
-# Pairs whose agreement is remembered, pairs as which the prior counts (covariances are right),
-# and the largest chi-square of a pair, per degree of freedom.
-_REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
+# Number of frames by whose arrival the clocks are compared. Fewer would take a burst of the
+# transport for another clock; more would notice it later. [chosen: under a second at 30 Hz]
+_ARRIVALS = 20
+# Number of the latest pairs on whose poses the shift by a deviation is evaluated. Fewer would
+# follow the motion of a moment; more would forget late what a quiet motion is.
+# [chosen: about 5 s of pairs]
+_EFFECTS = 30
+# Number of pairs whose agreement is remembered, by an exponential mean. Fewer make the factor of
+# the covariance itself noise; more follow a change of light late.
+# [chosen: the effective number of pairs of 4 s]
+_REMEMBERED = 20.0
+# Number of pairs as which the prior counts that covariances are right. Fewer would widen the first
+# pairs of each recording by chance. [chosen: half of those that are remembered]
+_PRIOR_PAIRS = 10.0
+# Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
+# a moving object would widen the pairs of many seconds.
+# [chosen: far above the 99.9 % quantile of two degrees of freedom, 6.9]
+_LARGEST_DISAGREEMENT = 20.0
 
 
 class _Due(NamedTuple):
@@ -269,10 +282,14 @@ def _disagreement(before: RelativePose, after: RelativePose) -> float:
     return float(apart @ np.linalg.solve(across.T @ spread @ across, apart))
 
 
-# 1 sigma [s] below which an estimate is applied.
+# 1 sigma [s] below which an estimate is applied. A larger one would apply noise.
+# [chosen: 1 to 4 ms: a camera that turns by 1 rad/s moves by 2 mrad in it]
 _APPLIED_SIGMA = 2e-3
-# Largest changes of the applied values [s per pair].
-_OFFSET_STEP, _READOUT_STEP = 1e-3, 5e-4
+# Largest change of the applied time offset [s per pair]. A larger one would shift the poses of
+# neighbouring pairs against each other. [chosen: an error of 50 ms is gone after 50 pairs]
+_OFFSET_STEP = 1e-3
+# The same of the readout time [s per pair]. [chosen: its error moves rows by half as much]
+_READOUT_STEP = 5e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """Folders of Android loggers: PoseCam, MARS Logger, OpenCamera Sensors; and VideoIMUCapture."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 import logging
 import math
 from pathlib import Path
@@ -68,7 +69,7 @@ def read_posecam(folder: Path) -> Recording:
     known = camera if isinstance(camera, Mapping) else {}
     logged = known.get('sensor_orientation_deg')
     orientation = logged if type(logged) is int else None
-    return phone_recording(
+    recorded = phone_recording(
         folder,
         ': recorded with PoseCam',
         images,
@@ -82,9 +83,9 @@ def read_posecam(folder: Path) -> Recording:
             STAMP_ROW_OF_ANDROID,
         ],
         camera_axes(logged),
-        _truth(poses, folder / 'manifest.json'),
         orientation=orientation,
     )
+    return replace(recorded, truth=_truth(poses, folder / 'manifest.json'))
 
 
 def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[SourcedValue]]:

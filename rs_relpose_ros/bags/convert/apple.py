@@ -5,6 +5,7 @@ values are in multiples of the standard gravity.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 from pathlib import Path
 
@@ -125,7 +126,7 @@ def read_stray_scanner(folder: Path) -> Recording:
         )
         for row, force in zip(samples, forces, strict=True)
     ]
-    return phone_recording(
+    recorded = phone_recording(
         folder,
         ': recorded with Stray Scanner',
         video.frames(stamps_ns, folder / 'odometry.csv'),
@@ -133,8 +134,8 @@ def read_stray_scanner(folder: Path) -> Recording:
         (),
         (*_stray_lens(folder / 'camera_matrix.csv', video), _STAMP_ROW),
         displayed_axes(video, imu),
-        tuple(map(_stray_pose, stamps_ns, poses)),
     )
+    return replace(recorded, truth=tuple(map(_stray_pose, stamps_ns, poses)))
 
 
 def _stray_lens(path: Path, video: Video) -> list[SourcedValue]:

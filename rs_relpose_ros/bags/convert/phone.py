@@ -29,7 +29,6 @@ from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages.incoming import TruePose
 
 Reader = Callable[[Path], Recording]
 
@@ -73,7 +72,6 @@ def phone_recording(
     accel: Sequence[ImuSample] = (),
     values: Sequence[SourcedValue] = (),
     axes: SourcedValue | None = None,
-    truth: tuple[TruePose, ...] = (),
     *,
     orientation: int | None = None,
 ) -> Recording:
@@ -94,7 +92,6 @@ def phone_recording(
         f'Parameters of relpose_node for {folder.name} (`rs_relpose convert phone`){details}.',
         (recording.COMPRESSED, *values, *defaults, axes),
         accel,
-        truth,
     )
 
 
