@@ -52,7 +52,8 @@ def test_a_pair_without_consensus_has_few_samples():
     alone = estimate(scene)
     assert aided.status is alone.status is Status.NO_CONSENSUS
     limit = CONFIG.max_iterations
-    assert aided.iterations <= limit + 500 < 2 * limit == alone.iterations
+    iterations = aided.diagnostics.iterations
+    assert iterations <= limit + 500 < 2 * limit == alone.diagnostics.iterations
 
 
 # Limits: twice the prototype's medians (design, section 4); the 5-point on derotated rays has
@@ -188,7 +189,7 @@ def test_a_gyro_that_contradicts_the_images_has_no_pose(seed):
     assert gyro_prior(scene, (0.0, 6e-4, 0.0))
     wrong = gyro_prior(scene, (0.0, 0.02, 0.0))
     assert wrong.status is Status.NO_CONSENSUS and np.isnan(wrong.R).all()
-    assert wrong.rejected.inliers.mean() > 0.8  # a wrong translation fits most matches
+    assert wrong.diagnostics.rejected.inliers.mean() > 0.8  # a wrong translation fits most matches
     apart = float(re.search(r'rotation ([.\d]+) deg', wrong.reason)[1])
     assert apart == pytest.approx(1.1, abs=0.2)
     assert gyro_prior(scene, (0.0, 0.02, 0.0), sigma=0.02)

@@ -458,8 +458,13 @@ def test_no_frames_between_change_nothing(scene):
         (scene.pose(between=blind), 'no frame between'),
         (scene.pose(between=turned), 'tracks and gyro'),
     ):
-        assert other.frames == 2 and other.frames_reason.startswith(reason)
-        assert bool(reason) == bool(other.frames_reason)
+        assert other.diagnostics.frames == 2 and other.diagnostics.frames_reason.startswith(reason)
+        assert bool(reason) == bool(other.diagnostics.frames_reason)
+        np.testing.assert_allclose(
+            other.diagnostics.pixel_sigma,
+            two.diagnostics.pixel_sigma,
+            rtol=1e-7 if reason else 0.0,
+        )
         for name in (
             'R',
             't',
@@ -470,7 +475,6 @@ def test_no_frames_between_change_nothing(scene):
             'baseline',
             'baseline_log_sigma',
             'velocity_covariance',
-            'pixel_sigma',
         ):
             np.testing.assert_allclose(
                 getattr(other, name),
@@ -481,9 +485,11 @@ def test_no_frames_between_change_nothing(scene):
     without_gyro = scene.pose(
         relative_rotation=None, relative_rotation_covariance=None, inertial=None
     )
-    assert without_gyro.frames == 2 and 'gyro' in without_gyro.frames_reason
+    assert without_gyro.diagnostics.frames == 2
+    assert 'gyro' in without_gyro.diagnostics.frames_reason
     paper = scene.pose(config=EstimatorConfig(refinement='none'))
-    assert paper.frames == 2 and 'two views' in paper.frames_reason
+    assert paper.diagnostics.frames == 2
+    assert 'two views' in paper.diagnostics.frames_reason
 
 
 def test_tracks_may_be_missing_and_wrong(scene):

@@ -286,7 +286,7 @@ def test_frames_between_close_ones_are_used(library, returned):
     true = states.R_world_cam[0].T @ (states.position[1] - states.position[0])
     true /= np.linalg.norm(true)
     two = estimate_wide_pair(views[0], later[-1], parameters).pose
-    assert two.frames == 2
+    assert two.diagnostics.frames == 2
     assert np.linalg.norm(pose.t - true) < 0.8 * np.linalg.norm(two.t - true)
     # Frames with another gyro or another calibration are left out.
     zoomed = [replace(view, intrinsics=replace(view.intrinsics, fx=500.0)) for view in later[:-1]]

@@ -43,7 +43,8 @@ def changed(bag: Path, out: Path, change: Callable[[int, Entry], Iterator[Entry]
     with open_bag(bag) as opened, BagWriter(out) as writer:
         types = {topic.name: topic.msgtype for topic in opened.topics}
         entries = []
-        for topic, received, message in opened.messages(opened.topics):
+        for entry in opened.messages(opened.topics):
+            topic, received, message = entry.topic, entry.bag_time_ns, entry.message
             number = counts[topic] = counts.get(topic, -1) + 1
             entries += list(change(number, (topic, types[topic], message, received)))
         for topic, msgtype, message, received in sorted(entries, key=lambda entry: entry[3]):

@@ -162,7 +162,9 @@ def find_inconsistencies(
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
         needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
-        if not found and solution.evidence(quantity) - other.evidence(second) < needed:
+        lead = solution.evidence(quantity) - other.evidence(second)
+        # A second one of more evidence is not certain: its pairs contradict each other.
+        if not found and 0.0 <= lead < needed:
             alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
@@ -178,14 +180,21 @@ def _ranked(
     estimated: Calibration,
     configured: Configured,
 ) -> list[tuple[Quantity, _Solution]]:
-    """Hypotheses that free one more quantity each; the one with most evidence first."""
-    return sorted(
-        (
-            (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
-            for quantity in quantities
-        ),
-        key=lambda item: -item[1].evidence(item[0]),
-    )
+    """Hypotheses that free one more quantity each.
+
+    Those that are certain come first, and of these the one with most evidence.
+    """
+
+    def rank(hypothesis: tuple[Quantity, _Solution]) -> tuple[bool, float]:
+        quantity, solution = hypothesis
+        is_certain = solution.certainty(quantity.part) >= _CERTAIN
+        return not is_certain, -solution.evidence(quantity)
+
+    hypotheses = [
+        (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
+        for quantity in quantities
+    ]
+    return sorted(hypotheses, key=rank)
 
 
 def likely(estimated: Calibration, configured: Configured) -> Array:

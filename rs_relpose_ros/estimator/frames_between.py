@@ -114,7 +114,7 @@ def refined(
             frames_reason='tracks and gyro of the frames between contradict each '
             f'other: {adjusted.sigma:.1f} px',
         )
-    refined_pose = _result(
+    pose = _result(
         pose,
         adjusted,
         path,
@@ -123,9 +123,9 @@ def refined(
     )
     changes = _changes_by(LIVE, path)
     if changes is None:
-        return refined_pose
+        return pose
     by_deviation = _pose_by_deviation(adjusted, tracks, priors, changes)
-    return replace(refined_pose, by_deviation=by_deviation)
+    return replace(pose, by_deviation=by_deviation)
 
 
 def _pose_by_deviation(

@@ -314,10 +314,27 @@ class Sequencer:
                     return None
         if isinstance(head, FrameRefused):
             return head
+        image = head.image
+        taken_ns = self._now()
         try:
-            frame = self._decoded(head)
+            if self._colors:
+                values, encoding = image.pixels(self._levels)
+            else:
+                values, encoding = image.decoded(self._levels), 'mono8'
+            frame: Frame[Any] = Frame(
+                image.stamp_ns,
+                values,
+                image.frame_id,
+                head.intrinsics,
+                encoding=encoding,
+                encoded=image if self._colors else None,
+                exposure=head.exposure,
+                ahead=head.ahead,
+                ready_ns=head.ready_ns or 0,
+                taken_ns=taken_ns,
+            )
         except InputError as error:
-            return self._refused(head.image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+            return self._refused(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
@@ -347,28 +364,6 @@ class Sequencer:
             self._taken_generation = self._generation
             self._counts.frames_taken += 1
             return frame
-
-    def _decoded(self, head: QueuedFrame) -> Frame[Any]:
-        """A frame of the queue with its pixels, not yet with its IMU data; InputError."""
-        taken_ns = self._now()
-        image = head.image
-        if self._colors:
-            values, encoding = image.pixels(self._levels)
-        else:
-            values = image.decoded(self._levels)
-            encoding = 'mono8'
-        return Frame(
-            image.stamp_ns,
-            values,
-            image.frame_id,
-            head.intrinsics,
-            encoding=encoding,
-            encoded=image if self._colors else None,
-            exposure=head.exposure,
-            ahead=head.ahead,
-            ready_ns=head.ready_ns or 0,
-            taken_ns=taken_ns,
-        )
 
     def _waits(self, deadline_ns: int) -> bool:
         """Wait for a change of the queue, or until its head is too old; False at the deadline."""
