@@ -157,6 +157,10 @@ def test_clock_of_the_accelerometer_is_named(walk, tmp_path, capsys):
     check, report, replay, _ = both(capsys, walk, bag)
     assert (check, replay) == (0, 0)
     assert 'clock of the accelerometer (/imu/accel) is 3.5 s behind that of the gyro' in report
+    out = tmp_path / 'path'
+    assert main.main(['odometry', str(bag), '--params', str(walk[1]), '--out', str(out)]) == 2
+    assert 'a path needs both sensors' in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_a_counter_of_32_bits_is_named(walk, tmp_path, capsys):

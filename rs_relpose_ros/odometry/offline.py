@@ -23,6 +23,7 @@ from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.messages.published_pair import PublishedPair
+from rs_relpose_ros.messages.streams import check_timelines, Kind
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.loops import close_loops, Paths, Views
@@ -104,6 +105,7 @@ def odometry_into(
     Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz]. `loops`:
     whether the smoothed path has loop closures.
     """
+    _require_accelerometer(bag, topics)
     prepare_folder(folder, _FILES)
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
@@ -353,6 +355,16 @@ def follow(
         _add(estimator, sample)
         take(sample_ns)
     return live + estimator.take(end=True)
+
+
+def _require_accelerometer(bag: Bag, topics: SensorTopics) -> None:
+    """InputError for an accelerometer on another clock, by which a path would be wrong."""
+    for fault in check_timelines(bag.timeline, topics):
+        if fault.kind is Kind.ACCEL_CLOCK:
+            raise InputError(
+                f'{bag.path}: {fault.message}, and a path needs both sensors: have their driver '
+                'stamp them with one clock; "rs_relpose replay" needs the gyro alone'
+            )
 
 
 def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]]:
