@@ -517,15 +517,18 @@ def evaluated(
 
 def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[model.Unknowns, Array]:
     """Unknowns and covariance of a fit with the errors that are common to the recording."""
-    common = np.where(final.free, _COMMON_IN_IMAGES if config.exposed else _COMMON, 0.0)
-    unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
+    sigmas = _COMMON_IN_IMAGES if config.exposed else _COMMON
+    common = np.where(final.free, sigmas, 0.0)
+    covariance = final.covariance + np.diag(common**2)
     if not final.free[model.FOCAL]:
-        return unknowns, covariance
+        return final.unknowns, covariance
     # Widened, the sigmas of the lens may exceed the sigmas of its priors.
     prior = final.problem.prior
     known = np.flatnonzero(_LENS & (np.diag(prior) > 0.0))
-    of_prior = np.asarray(np.linalg.inv(prior[np.ix_(known, known)]), dtype=np.float64)
-    return joined(unknowns, covariance, known, final.problem.center[known], of_prior)
+    information = prior[np.ix_(known, known)]
+    of_prior = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    center = final.problem.center[known]
+    return joined(final.unknowns, covariance, known, center, of_prior)
 
 
 def _offset_of_row_0(

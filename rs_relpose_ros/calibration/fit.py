@@ -165,14 +165,19 @@ def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
     path, parameters = _path(problem, unknowns), unknowns.parameters
     through = _through_lens(problem, unknowns)
     rays = []
+    offset, readout = parameters[model.OFFSET], parameters[READOUT]
     for times, rows, points in zip(problem.times, problem.rows, through.points, strict=True):
-        at = times[problem.pair] + parameters[model.OFFSET] + parameters[READOUT] * rows
+        row_times = times[problem.pair] + offset + readout * rows
         directions = np.column_stack([points, np.ones(len(points))])
-        directions /= np.linalg.norm(directions, axis=1)[:, None]
-        rays.append(np.einsum('nij,nj->ni', path.at(at), directions))
-    sines = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
-    angles = [np.median(sines[begin:end]) for begin, end in itertools.pairwise(problem.begin)]
-    passing = np.array(angles) / (problem.times[1] - problem.times[0])
+        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+        turned = path.at(row_times) @ (directions / lengths)[:, :, None]
+        rays.append(turned[:, :, 0])
+    first, second = rays
+    sines = np.linalg.norm(np.cross(first, second), axis=1)
+    parts = itertools.pairwise(problem.begin)
+    angles = np.array([np.median(sines[begin:end]) for begin, end in parts])
+    intervals = problem.times[1] - problem.times[0]
+    passing = angles / intervals
     bend = _BEND / np.maximum(passing, _LEAST_PARALLAX)
     return problem._replace(bend_sigma=np.clip(bend, *_BEND_RANGE))
 

@@ -136,12 +136,14 @@ def _truth(root: Path, T_body_cam: Array) -> tuple[TruePose, ...]:
 
 
 def _pose(row: Row, T_body_cam: Array) -> TruePose:
-    w, x, y, z = (row.real(column) for column in range(4, 8))
-    R = Rotation.from_quat([x, y, z, w])
-    length = float(np.linalg.norm([w, x, y, z]))
+    wxyz = np.array([row.real(column) for column in range(4, 8)])
+    length = float(np.linalg.norm(wxyz))
     if abs(length - 1.0) > _QUATERNION_TOLERANCE:
         raise row.error(f'the quaternion must have length 1, got {length:.3g}')
-    position = np.array(row.vector(1, 2, 3)) + R.apply(T_body_cam[:3, 3])
-    qx, qy, qz, qw = (R * Rotation.from_matrix(T_body_cam[:3, :3])).as_quat().tolist()
-    px, py, pz = position.tolist()
+    R_world_body = Rotation.from_quat(np.roll(wxyz, -1))
+    R_body_cam = Rotation.from_matrix(T_body_cam[:3, :3])
+    to_camera = R_world_body.apply(T_body_cam[:3, 3])
+    px, py, pz = (np.array(row.vector(1, 2, 3)) + to_camera).tolist()
+    R_world_cam = R_world_body * R_body_cam
+    qx, qy, qz, qw = R_world_cam.as_quat().tolist()
     return TruePose(row.nanoseconds(0), (px, py, pz), (qx, qy, qz, qw))
