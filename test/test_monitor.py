@@ -1390,13 +1390,13 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
             1e-3,
             1.2,
         ),
-        # 0.51 ms off with OpenCV 4.6.
+        # 0.62 ms off with OpenCV 4.6, since the principal point is estimated, too.
         (
             ('readout_time=0.034', 'track_readout_time=true'),
             'readout_time',
             0.03,
             -0.004,
-            6e-4,
+            7e-4,
             1.0,
         ),
     ],
