@@ -21,8 +21,10 @@ from rs_relpose_ros.calibration.fit import (
     Fit,
     Flags,
     minimised,
+    MOST_ROUNDS,
     normal_equations,
     sums_of,
+    TOLERANCE,
 )
 from rs_relpose_ros.calibration.model import GLOBAL, Problem, ROTATION, Unknowns
 from rs_relpose_ros.core.least_squares import (
@@ -58,8 +60,8 @@ def fit(
     unknowns: Unknowns,
     free: Flags,
     *,
-    rounds: int = 60,
-    tolerance: float = 0.05,
+    rounds: int = MOST_ROUNDS,
+    tolerance: float = TOLERANCE,
 ) -> Fit:
     """`minimised`, with the covariance by the noise of the matches.
 

@@ -449,13 +449,21 @@ class Fit:
         return block_of(self.free)
 
 
+# Largest number of rounds of a fit. Fewer may end it before its optimum; more only bound the time
+# of a fit that does not converge later. [chosen: other values were not tried]
+MOST_ROUNDS = 60
+# Newton step, in sigmas of the parameters, that ends a fit. A larger one would leave an error that
+# its sigmas do not contain. [chosen: far below one sigma; other values were not tried]
+TOLERANCE = 0.05
+
+
 def minimised(
     problem: Problem,
     unknowns: Unknowns,
     free: Flags,
     *,
-    rounds: int = 60,
-    tolerance: float = 0.05,
+    rounds: int = MOST_ROUNDS,
+    tolerance: float = TOLERANCE,
 ) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and estimate the noise meanwhile.
 
