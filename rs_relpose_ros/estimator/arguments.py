@@ -191,17 +191,19 @@ def _problem(
     """The problem of the checked arguments; InputError if `between` does not fit them."""
     motion2, interval, (rotation, covariance), inertial = last
     _check_between(between, matches.points1, interval)
-    points = [matches.points1, *(frame.points for frame in between), matches.points2]
+    if between:
+        points = [matches.points1, *(frame.points for frame in between), matches.points2]
+        matches = replace(matches, points=np.stack(points))
     rotations = [frame.relative_rotation for frame in between]
     covariances = [frame.relative_rotation_covariance for frame in between]
     end = math.nan if interval is None else interval
     return PairProblem(
-        replace(matches, points=np.stack(points)),
+        matches,
         camera,
         (motion1, *(frame.motion for frame in between), motion2),
         np.array([0.0, *(frame.interval for frame in between), end]),
-        _stacked([np.eye(3), *rotations, rotation]),
-        _stacked([np.zeros((3, 3)), *covariances, covariance]),
+        _after_first(np.eye(3), [*rotations, rotation]),
+        _after_first(np.zeros((3, 3)), [*covariances, covariance]),
         (None, *(frame.inertial for frame in between), inertial),
         config,
         seed,
@@ -267,7 +269,11 @@ def _check_between(
         before = frame.interval
 
 
-def _stacked(matrices: Sequence[Array | None]) -> Array:
-    """Matrices (V, 3, 3); NaN where there is none."""
-    unknown = np.full((3, 3), math.nan)
-    return np.stack([unknown if matrix is None else matrix for matrix in matrices])
+def _after_first(first: Array, others: Sequence[Array | None]) -> Array:
+    """Matrices (V, 3, 3) of the first frame and of the others; NaN where there is none."""
+    matrices = np.full((len(others) + 1, 3, 3), math.nan)
+    matrices[0] = first
+    for number, matrix in enumerate(others, 1):
+        if matrix is not None:
+            matrices[number] = matrix
+    return matrices

@@ -117,8 +117,8 @@ def _certain(pose: RelativePose, config: EstimatorConfig) -> RelativePose:
     """The pose, or its rotation alone if the direction of t is too uncertain."""
     limit = config.max_translation_sigma
     # Of both degrees of freedom of a direction, together.
-    variance = max(np.trace(pose.covariance[:3, :3]), 0.0)
-    sigma = np.degrees(np.sqrt(variance))
+    variance = max(float(np.trace(pose.covariance[:3, :3])), 0.0)
+    sigma = math.degrees(math.sqrt(variance))
     if not pose or sigma <= limit:
         return pose
     return pose.without_translation(
@@ -384,8 +384,7 @@ class Estimation:
         start = so3.aligning_rotation(of_rays)
         R, information = fit.fit_rotation(observations, inliers, start, self.priors, focal, sigma)
         residuals = fit.transfer_errors(observations, inliers, R, focal)
-        rms = float(np.sqrt(np.mean(residuals**2)))
-        median = so3.median(residuals)
+        median = so3.median(residuals.copy())
         least = self.config.min_parallax
         if median < ROTATION_ONLY_SIGMAS * sigma:
             status = Status.PURE_ROTATION
@@ -399,6 +398,7 @@ class Estimation:
         else:
             return None
         pose = self._rotation(R, information)
+        rms = float(np.sqrt(np.mean(residuals**2)))
         return replace(pose, status=status, reason=reason).diagnosed(residual_rms=rms)
 
     def _rotation(self, R: Array, information: Array) -> RelativePose:

@@ -86,11 +86,10 @@ def build_problem(
             observations[:, VIEW_2 * image : VIEW_2 * (image + 1)],
         )
         observations[:, TIMES + image] = row_times
-    valid = np.asarray(np.isfinite(observations).all(axis=1))
-    observations[~valid] = 0.0
+    valid, points = _usable(observations)
     return TwoViewProblem(
         observations,
-        _at_unit_depth(observations),
+        points,
         valid,
         0.5 * (camera.fx + camera.fy),
         motion1,
@@ -127,11 +126,21 @@ def derotate(
 
 
 @kernel
-def _at_unit_depth(observations: Array) -> Array:
-    """The points (6, N) of `sampling.multi_scale_cost`; NaN behind one of the cameras."""
+def _usable(observations: Array) -> tuple[Flags, Array]:
+    """Which rows are finite, and the points (6, N) of `sampling.multi_scale_cost`.
+
+    The other rows become zero. Points are NaN there, and behind one of the cameras.
+    """
+    valid = np.empty(len(observations), dtype=np.bool_)
     points = np.full((6, len(observations)), np.nan)
     for i in range(len(observations)):
         o = observations[i]
+        total = 0.0  # is finite if all numbers are
+        for number in o:
+            total += number
+        valid[i] = math.isfinite(total)
+        if not valid[i]:
+            o[:] = 0.0
         depth1 = o[VIEW_1 + 2]
         depth2 = o[VIEW_2 + 2]
         if depth1 > _NEAREST and depth2 > _NEAREST:
@@ -139,7 +148,7 @@ def _at_unit_depth(observations: Array) -> Array:
                 points[k, i] = o[VIEW_1 + k] / depth1
                 points[2 + k, i] = o[VIEW_2 + k] / depth2
                 points[4 + k, i] = o[TIMES + k]
-    return points
+    return valid, points
 
 
 # -- The pose between two rows, with its covariance -----------------------------------------------

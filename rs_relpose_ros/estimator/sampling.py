@@ -578,7 +578,8 @@ def correlation(observations: Array, use: Flags, first: int, second: int) -> Arr
 def distinct_directions(observations: Array, inliers: Flags, first: int, cell: float) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
     cells = np.round(observations[inliers, first : first + 2] / cell)
-    return len(set((cells @ [1.0, 1e6]).tolist()))
+    numbers = np.sort(cells @ [1.0, 1e6])
+    return min(len(numbers), 1) + int(np.count_nonzero(numbers[1:] != numbers[:-1]))
 
 
 def distance_from_a_plane(observations: Array, inliers: Flags, first: int) -> float:

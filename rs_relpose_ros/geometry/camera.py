@@ -266,7 +266,9 @@ class RollingShutterCamera:
     def _undistorted(self, distorted: Array) -> tuple[Array, Array]:
         """Undistorted points (N, 2), and their derivatives (N, 2, 2) by the distorted points."""
         if self.is_undistorted:
-            return distorted, np.tile(np.eye(2), (len(distorted), 1, 1))
+            unchanged = np.empty((len(distorted), 2, 2))
+            unchanged[:] = np.eye(2)
+            return distorted, unchanged
         return undistort_points(distorted, self._lens.first_guess(distorted), self._compiled)
 
     @property
