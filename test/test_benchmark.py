@@ -17,6 +17,7 @@ from rs_relpose_lab.experiments import (
     methods,
     speed,
     suggestions,
+    true_pairs,
     trust,
     trust_rows,
     trust_runs,
@@ -30,7 +31,7 @@ from rs_relpose_lab.experiments.trust_runs import TrackNoise
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.offline.replay import read_truth
@@ -156,7 +157,13 @@ def test_nees_of_errors_drawn_from_a_covariance(claimed):
             pair_errors.pair_consistency(
                 '',
                 '',
-                pair_errors.TruePair(0, 1, turned, true_t, claimed * sigma, claimed * R_sigma),
+                true_pairs.TruePair(
+                    0,
+                    1,
+                    turned,
+                    true_t,
+                    true_pairs.isotropic(claimed * sigma, claimed * R_sigma),
+                ),
                 pose,
             )
         )
@@ -195,9 +202,9 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
             R, t = truth.relative_pose(start + delay_ns, end + delay_ns)
             writer.writerow([start, end, *R.ravel(), *t / np.linalg.norm(t), 1.0, 0.1])
     # The first is that of the largest axis, the second the root of the sum over three.
-    assert [pair[4:] for pair in pair_errors.read_true_pairs(table)] == [
-        pytest.approx(np.radians([1.0, 0.1 / np.sqrt(3.0)]))
-    ] * 4
+    sigmas = np.radians(np.repeat([1.0, 0.1 / np.sqrt(3.0)], 3))
+    for pair in true_pairs.read_true_pairs(table):
+        np.testing.assert_allclose(pair.covariance, np.diag(sigmas**2))
     assert (
         main(
             [
@@ -263,6 +270,70 @@ def test_suggested_values_of_wrong_parameters(bundled_bag, tmp_path, monkeypatch
     report = (tmp_path / 'suggestions.md').read_text()
     assert re.search(r'^\| right +\| +ok \|$', report, re.MULTILINE)
     assert '1 of 1 errors of over 6 sigmas named' in report
+
+
+def _write_path(folder, stamps, truth, delay_ns):
+    """Write a true path of frames, with covariances of those 1 to 10 apart; return its file."""
+    first = stamps[0]
+    rows = []
+    for stamp in stamps:
+        known = truth.relative_pose(first + delay_ns, stamp + delay_ns)
+        R, t = (np.eye(3), np.zeros(3)) if stamp == first else known
+        rows.append([stamp, *t, *Rotation.from_matrix(R).as_quat()])
+    table = folder / 'global_truth.csv'
+    with table.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(['stamp_ns', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'])
+        writer.writerows(rows)
+    covariance = true_pairs.isotropic(0.01, 1e-3)
+    covariance[0, 5] = covariance[5, 0] = 1e-6
+    triangle = covariance[np.triu_indices(6)]
+    ends = np.array(
+        [
+            (first, last)
+            for k in range(1, 11)
+            for first, last in zip(stamps, stamps[k:], strict=False)
+        ]
+    )
+    np.savez(
+        folder / 'global_truth_cov.npz',
+        s1=ends[:, 0],
+        s2=ends[:, 1],
+        C=np.tile(triangle, (len(ends), 1)),
+    )
+    return table, covariance
+
+
+def test_a_true_path_is_that_of_the_pairs_of_the_policy(bundled_bag, tmp_path):
+    """Calibrated on the first half of the bundled bag, scored on the second."""
+    stamps = pair_errors.image_stamps(bundled_bag)
+    with open_bag(bundled_bag) as bag:
+        truth = read_truth(bag, bag.find_topics())
+    parameters = read_parameters(BUNDLED_PARAMETERS)
+    offset_ns = round(1e9 * parameters.sensor.time_offset)
+    table, covariance = _write_path(tmp_path, stamps[2:-2], truth, offset_ns)
+    known = true_pairs.read_truth(tmp_path)
+    pair = known.pair(stamps[20], stamps[25])
+    R, t = truth.relative_pose(stamps[20] + offset_ns, stamps[25] + offset_ns)
+    np.testing.assert_allclose(pair.R, R, atol=1e-6)
+    np.testing.assert_allclose(pair.t, t, atol=1e-6)
+    np.testing.assert_allclose(pair.covariance, covariance)
+    assert known.pair(stamps[20], stamps[31]).covariance is None
+    assert known.pair(stamps[0], stamps[5]) is None
+    (tmp_path / 'pseudo_truth.csv').write_text('never read')
+    arguments = ['--scored', str(bundled_bag), str(tmp_path), '--lens-known']
+    assert main(['benchmark', 'carried-over', *arguments, '--output', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'consistency.csv')
+    assert len(rows) >= 4
+    assert {row['source'] for row in rows} == {'calibrated on its first half'}
+    assert min(int(row['stamp1_ns']) for row in rows) >= stamps[len(stamps) // 2]
+    # The readout of 30 ms is known by the first half.
+    rotations = [float(row['rotation']) for row in rows if row['rotation']]
+    assert len(rotations) >= 3 and np.median(rotations) < 0.05
+    assert any(row['translation_nees'] for row in rows)
+    table.with_name('global_truth_cov.npz').unlink()
+    with pytest.raises(MissingInputError, match='has the covariances of'):
+        true_pairs.read_truth(table)
 
 
 def test_differing_poses_are_found(tmp_path):

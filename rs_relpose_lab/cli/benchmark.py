@@ -403,9 +403,10 @@ def _run_cases(args: argparse.Namespace) -> int:
     ),
     _paths(
         '--recording',
-        ('BAG', 'PARAMETERS', 'PAIRS'),
-        'a recording, its parameter file and a table of true pairs (pseudo_truth.csv); may be '
-        'given several times',
+        ('BAG', 'PARAMETERS', 'TRUTH'),
+        'a recording, its parameter file and its truth: a table of true pairs (pseudo_truth.csv), '
+        'a true path with covariances (global_truth.csv), or the folder of either, the path if '
+        'there is one; may be given several times',
         nargs=3,
         action='append',
         default=[],
@@ -437,6 +438,40 @@ def _run_consistency(args: argparse.Namespace) -> int:
     return _report_of(
         chosen, lambda measure: list(measure()), consistency.write_report, args, 'bag'
     )
+
+
+@_benchmark(
+    'carried-over',
+    'calibrate a camera on one recording, score the poses of another one: errors, and squared '
+    'errors in units of the covariances',
+    _paths(
+        '--scored',
+        ('BAG', 'TRUTH'),
+        'the recording that is scored, and its true path (global_truth.csv) or folder',
+        nargs=2,
+        required=True,
+    ),
+    _paths(
+        '--calibrated',
+        'BAG',
+        'recordings of the same camera that it is calibrated on, several of them together '
+        '(default: the first half of the scored one, whose second half is then scored)',
+        nargs='+',
+        default=[],
+    ),
+    _flag('--lens-known', 'keep the lens of the CameraInfo (default: estimate it)'),
+)
+def _run_carried_over(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import carried_over, consistency
+
+    args.output.mkdir(parents=True, exist_ok=True)
+    scored, truth = args.scored
+    protocol = carried_over.Protocol(scored, truth, tuple(args.calibrated))
+
+    def measure(one: carried_over.Protocol) -> list[consistency.PairConsistency]:
+        return list(carried_over.carried_over(one, args.output, lens_known=args.lens_known))
+
+    return _report_of([protocol], measure, consistency.write_report, args, 'recording')
 
 
 @_benchmark(

@@ -5,12 +5,10 @@ frames), whose covariance is added to the estimate's own.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-import csv
 from dataclasses import dataclass, replace
 import itertools
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,19 +17,19 @@ from rs_relpose_lab.experiments.comparison import opencv_pose
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_lab.experiments.methods import Pose
 from rs_relpose_lab.experiments.scoring import chi_squares, pose_error
+from rs_relpose_lab.experiments.true_pairs import read_truth, TruePair, TruePath
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.bag import render_once
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.messages import incoming
-from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, Replay
+from rs_relpose_ros.offline.replay import MessageRefused, outcomes, Replay
+from rs_relpose_ros.offline.replay import read_truth as truth_of_bag
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 
@@ -50,20 +48,11 @@ SIMULATED, RECORDED = 'simulated', 'recordings'
 NO_READOUT, MAGSAC = 'readout ignored', 'MAGSAC'
 IGNORE_READOUT = {'readout_time': 0.0, 'withhold_when_wrong': False}
 THRESHOLD = 1.0
+# Covariance of the truth of a simulation.
+_EXACT = np.zeros((6, 6))
 
 # The pose of a pair by one of these.
 Method = Callable[[PairResult, Intrinsics], 'RelativePose | Pose | None']
-
-
-class TruePair(NamedTuple):
-    """Pose ``X1 = R X2 + t`` of two frames' stamped rows, 1 sigma of t and R per axis [rad]."""
-
-    stamp1_ns: int
-    stamp2_ns: int
-    R: Array
-    t: Array
-    t_sigma: float = 0.0
-    R_sigma: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,15 +93,9 @@ def pair_consistency(
         return found
     error = pose_error(pose.R, pose.t, true.R, true.t)
     found = replace(found, rotation=error.rotation, translation=error.translation)
-    if pose.covariance is None:
+    if pose.covariance is None or true.covariance is None:
         return found
-    nees = chi_squares(
-        pose.R,
-        pose.t,
-        true.R,
-        true.t,
-        pose.covariance + np.diag(np.repeat([true.t_sigma**2, true.R_sigma**2], 3)),
-    )
+    nees = chi_squares(pose.R, pose.t, true.R, true.t, pose.covariance + true.covariance)
     return replace(
         found,
         rotation_nees=nees.rotation / R_FREEDOM,
@@ -159,7 +142,7 @@ def replayed(
     """Pairs of a simulated bag, without those at rest."""
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
-        truth = read_truth(bag, topics)
+        truth = truth_of_bag(bag, topics)
         assert truth is not None
         for result in Replay(bag, topics, parameters).pairs():
             known = truth.relative_pose(result.reference_ns1, result.reference_ns2)
@@ -167,34 +150,9 @@ def replayed(
                 yield pair_consistency(
                     source,
                     name,
-                    TruePair(result.reference_stamp_ns, result.stamp_ns, *known),
+                    TruePair(result.reference_stamp_ns, result.stamp_ns, *known, _EXACT),
                     result.pose,
                 )
-
-
-def read_true_pairs(path: Path) -> list[TruePair]:
-    """Pairs of a table with columns stamp1_ns, stamp2_ns, r11 to r33, tx, ty, tz and two sigmas.
-
-    `sigma_t_deg` is that of the largest axis, `sigma_r_deg` the root of the sum over three axes.
-    """
-    if not path.is_file():
-        raise MissingInputError(f'there is no table of true pairs {path}')
-    with path.open(newline='', encoding='utf-8') as file:
-        rows = list(csv.DictReader(file))
-    try:
-        return [
-            TruePair(
-                int(row['stamp1_ns']),
-                int(row['stamp2_ns']),
-                np.array([[float(row[f'r{i}{j}']) for j in (1, 2, 3)] for i in (1, 2, 3)]),
-                np.array([float(row[f't{axis}']) for axis in 'xyz']),
-                math.radians(float(row['sigma_t_deg'])),
-                math.radians(float(row['sigma_r_deg'])) / math.sqrt(3.0),
-            )
-            for row in rows
-        ]
-    except (KeyError, ValueError) as error:
-        raise InputError(f'{path} is no table of true pairs: {error}') from error
 
 
 def on_recording(
@@ -202,22 +160,63 @@ def on_recording(
 ) -> Iterator[PairConsistency]:
     """The true pairs of a recording, as a node publishes them that has run from its begin.
 
-    `compare`: also with a readout time of 0, and OpenCV's 5-point on the same matches.
+    `truth`: a table of pairs, a path of the camera, or a folder with one of them. With a path, the
+    pairs are those of the keyframe policy. `compare`: also with a readout time of 0, and OpenCV's
+    5-point on the same matches.
     """
-    parameters, pairs = read_parameters(parameter_file), read_true_pairs(truth)
+    parameters, known = read_parameters(parameter_file), read_truth(truth)
     methods: dict[str, Method] = {RECORDED: lambda pair, _: pair.pose}
     runs = [(parameters, methods)]
     if compare:
         methods[MAGSAC] = lambda pair, lens: opencv_pose(pair, lens, THRESHOLD)
         runs.append((parameters.updated(IGNORE_READOUT), {NO_READOUT: methods[RECORDED]}))
-    for (configured, methods), apart in itertools.product(runs, _passes(pairs)):
+    for configured, methods in runs:
+        if isinstance(known, TruePath):
+            pairs = policy_pairs(path, configured, known)
+        else:
+            pairs = _listed_pairs(path, configured, known)
+        for true, given in pairs:
+            for name, pose_of in methods.items():
+                pose = pose_of(*given) if given else None
+                yield pair_consistency(name, path.name, true, pose)
+
+
+# A true pair, with the pair of frames and the lens of its image if there is one.
+Given = tuple[TruePair, tuple[PairResult, Intrinsics] | None]
+
+
+def _listed_pairs(
+    path: Path, parameters: Parameters, known: Sequence[TruePair]
+) -> Iterator[Given]:
+    """Pairs of a table, in as many runs as they overlap."""
+    for apart in _passes(known):
         found = {
             (pair.reference_stamp_ns, pair.stamp_ns): (pair, lens)
-            for pair, lens in chosen_pairs(path, configured, [true[:2] for true in apart])
+            for pair, lens in chosen_pairs(path, parameters, [true.ends for true in apart])
         }
-        for true, (name, pose_of) in itertools.product(apart, methods.items()):
-            given = found.get(true[:2])
-            yield pair_consistency(name, path.name, true, pose_of(*given) if given else None)
+        for true in apart:
+            yield true, found.get(true.ends)
+
+
+def policy_pairs(path: Path, parameters: Parameters, known: TruePath) -> Iterator[Given]:
+    """Pairs of the keyframe policy whose frames are on a path, without those at rest."""
+    for pair, lens in _policy_results(path, parameters):
+        true = known.pair(pair.reference_stamp_ns, pair.stamp_ns)
+        if true is not None and np.linalg.norm(true.t) > 0.0:
+            yield true, (pair, lens)
+
+
+def _policy_results(path: Path, parameters: Parameters) -> Iterator[tuple[PairResult, Intrinsics]]:
+    """Pairs of the keyframe policy over a recording, each with its lens."""
+    front_end = FrontEnd(parameters, offline=True)
+    intake = incoming.Intake(front_end.sequencer, parameters)
+    with open_bag(path) as bag:
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        for outcome in outcomes(front_end, intake, incoming.sensor_messages(bag, topics)):
+            if isinstance(outcome, MessageRefused):
+                raise outcome.error
+            if isinstance(outcome, Frame) and outcome.result is not None:
+                yield outcome.result, outcome.intrinsics
 
 
 def _passes(pairs: Sequence[TruePair]) -> list[list[TruePair]]:
