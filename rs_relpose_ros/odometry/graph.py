@@ -54,9 +54,21 @@ _LEAST_SPEED = 0.1
 # Largest share of the window that one interval takes. A longer bridge would push the states before
 # it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
 _LONGEST_STEP = 0.25
-# Steps of the optimisation with a keyframe until the start, where the linearisation is far off.
+# Most steps of the optimisation with a keyframe. With fewer, a start would remain far off where
+# the way of the camera is not known at first; one step does for most keyframes.
 # [measured: with 10 another one changes no path by 0.2 mm, docs/lab/odometry.md]
-_START_STEPS = 10
+_MOST_STEPS = 10
+# Change of a camera's way between keyframes, as a share of it, from which another step follows:
+# directions are linearised at the way before. A larger one would take a direction along a short
+# way that is hardly known for one along a known way, a smaller one would take steps for nothing.
+# [measured: docs/lab/odometry.md, "Short ways": 0.3 leaves a velocity too certain, 0.1 does not]
+_MOVED = 0.1
+# Length of a way below which its change is taken relative to this length [m]: the way of a camera
+# that stays changes by any share. [chosen: 1 to 5 cm, below the way of any direction in use]
+_LEAST_WAY = 0.02
+# Newest keyframes whose ways are compared: a later one shows what an earlier way was.
+# [chosen: 3 to 6 would do, about half a second]
+_COMPARED = 3
 # Iterations of the optimiser for the smoothed path. Fewer would leave a path of loops unfinished.
 # [measured: as the tolerance: more change no path by 0.1 mm, docs/lab/odometry.md, "As a process"]
 _SMOOTHING_ITERATIONS = 10
@@ -193,6 +205,7 @@ class KeyframeGraph:
             graph.addPriorVector(V(0), start.velocity, of(VELOCITY))
             graph.addPriorConstantBias(B(0), bias, of(BIAS))
             graph.addPriorVector(L(0), start.doubts, of(DOUBTS))
+        self._ahead = values
         self._update(graph, values, 0, 0.0)
 
     @property
@@ -263,8 +276,7 @@ class KeyframeGraph:
                 graph.addPriorVector(key, np.zeros(3), at_zero)
         # States before a long bridge stay: the first pairs after it correct them, too.
         lasting = min(interval.duration, _LONGEST_STEP * self._config.smoothing_lag)
-        steps = _START_STEPS if pair is not None and gate == math.inf else 1
-        self._update(graph, values, j, self._seconds + lasting, steps)
+        self._update(graph, values, j, self._seconds + lasting)
         return innovation
 
     def _hold_still(self, graph: Any, step: _Step, certain: bool) -> None:
@@ -535,14 +547,21 @@ class KeyframeGraph:
         values: Any,
         newest: int,
         seconds: float,
-        steps: int = 1,
     ) -> None:
-        """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
+        """Add the newest keyframe, at `seconds` in the window; after a failure none is added.
+
+        A step is repeated where it has changed the ways of the camera, at which directions are
+        linearised.
+        """
         with _solving():
             # What all keyframes share stays in the window.
             times = dict.fromkeys([*values.keys(), L(0)], seconds)
+            ways = _ways(self._ahead, newest)
             self._smoother.update(graph, values, times)
-            for _ in range(steps - 1):
+            for _ in range(1, _MOST_STEPS):
+                before, ways = ways, _ways(self._smoother.calculateEstimate(), newest)
+                if _longest_share(ways - before, ways) < _MOVED:
+                    break
                 self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
             self._read(newest)
         self._count, self._seconds = newest + 1, seconds  # keyframes; time of the newest
@@ -569,6 +588,21 @@ class KeyframeGraph:
         self._step = _NO_STEP
         if self._record is not None:
             self._record[1].insert_or_assign(values)
+
+
+def _ways(values: Any, newest: int) -> Array:
+    """Ways (K, 3) of the camera between the newest keyframes [m]."""
+    arm = values.atVector(L(0))[doubts.ARM]
+    numbers = range(max(newest - _COMPARED, 0), newest + 1)
+    places = [values.atPose3(X(k)).transformFrom(arm) for k in numbers if values.exists(X(k))]
+    return np.diff(np.reshape(places, (-1, 3)), axis=0)
+
+
+def _longest_share(changes: Array, ways: Array) -> float:
+    """Largest change of a way as a share of its length."""
+    lengths = np.linalg.norm(ways, axis=1)
+    sizes = np.linalg.norm(changes, axis=1)
+    return float((sizes / np.maximum(lengths, _LEAST_WAY)).max(initial=0.0))
 
 
 def _mean_rate(interval: ImuInterval) -> Array:
