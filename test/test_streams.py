@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,9 @@ from rs_relpose_lab.simulation.simulation import simulate
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.cli import main
-from rs_relpose_ros.messages.streams import (
-    counter_unit,
-    find_bursts,
-    find_multiplied,
-    SensorRate,
-)
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.burst_times import find_bursts, SampleTimes
+from rs_relpose_ros.messages.streams import counter_unit, find_multiplied, SensorRate
 
 IMU, IMAGES = '/imu/data_raw', '/camera/image_raw/compressed'
 SECOND = 10**9
@@ -84,13 +82,54 @@ def in_bursts(number: int, entry: Entry) -> Iterator[Entry]:
     yield topic, msgtype, message, received
 
 
-def test_bursts_are_named_and_withheld(walk, tmp_path, capsys):
+def distances(folder: Path) -> np.ndarray:
+    """Errors of the rotation and of the direction of translation, in sigmas of their largest."""
+    with (folder / 'errors.csv').open(encoding='utf-8') as file:
+        errors = {
+            (row['reference_stamp_ns'], row['stamp_ns']): row for row in csv.DictReader(file)
+        }
+    with (folder / 'relative_poses.csv').open(encoding='utf-8') as file:
+        poses = [row for row in csv.DictReader(file) if row['status'] == 'OK']
+    out = []
+    for pose in poses:
+        error = errors[pose['reference_stamp_ns'], pose['stamp_ns']]
+        sigmas = [
+            np.degrees(np.linalg.norm([float(pose[f'sigma_{name}']) for name in names]))
+            for names in (('rx', 'ry', 'rz'), ('t1', 't2'))
+        ]
+        out.append(
+            np.array([float(error['rotation_error_deg']), float(error['translation_error_deg'])])
+            / sigmas
+        )
+    return np.array(out)
+
+
+def test_bursts_are_named_and_get_even_times(walk, tmp_path, capsys):
     bag = changed(walk[0], tmp_path / 'bag', in_bursts)
+    check, report, replay, _ = both(capsys, walk, bag)
+    assert (check, replay) == (0, 0)
+    assert 'bursts of 7' in report and 'true rate is 125 Hz' in report
+    assert 'deeper queue' not in report and 'with its own time' not in report
+    found = distances(bag.with_name('out'))
+    assert len(found) >= 3 and found.max() < 3.0
+
+
+def test_bursts_without_a_rate_are_named_and_withheld(walk, tmp_path, capsys):
+    starts = 56_000_000 * np.arange(1000)
+    arrivals = np.sort(starts + np.random.default_rng(2).integers(0, 400_000_000, 1000))
+
+    def unevenly(number: int, entry: Entry) -> Iterator[Entry]:
+        for topic, msgtype, message, received in in_bursts(number, entry):
+            burst = number // 7
+            late = int(arrivals[burst] - starts[burst]) if topic == IMU else 0
+            stamped(message, stamp_of(message) + late)
+            yield topic, msgtype, message, received + late
+
+    bag = changed(walk[0], tmp_path / 'bag', unevenly)
     check, report, replay, error = both(capsys, walk, bag)
     assert (check, replay) == (1, 2)
     for text in (report, error):
-        assert 'bursts of 7' in text and 'true rate is 125 Hz' in text
-    assert 'deeper queue' not in report
+        assert 'too unevenly for even times' in text and 'time of the sensor' in text
 
 
 def test_two_publishers_are_refused_with_both_names(walk, tmp_path, capsys):
@@ -201,15 +240,76 @@ def test_other_stamps_are_no_bursts(kind):
     assert find_bursts(steps_of(np.random.default_rng(5), kind)) is None
 
 
+# --- even times in place of those of bursts
+
+
+def samples_at(stamps: np.ndarray) -> list[ImuSample]:
+    return [ImuSample(int(stamp), (0.0, 0.0, 0.1), None) for stamp in stamps]
+
+
+def timed(times: SampleTimes, stamps: np.ndarray) -> list[ImuSample]:
+    return [one for sample in samples_at(stamps) for one in times.add(sample)]
+
+
 @pytest.mark.parametrize('size', [8, 20, 100])
 @pytest.mark.parametrize('apart_ns', [0, 100_000])
-def test_bursts_by_their_stamps(size, apart_ns):
-    number = np.arange(20 * size)
-    arrival = (number // size + 1) * size * 2_500_000
-    jitter = np.random.default_rng(1).integers(0, 2_000_000, 20)[number // size]
-    bursts = find_bursts(arrival + jitter + apart_ns * (number % size))
+@pytest.mark.parametrize('rate', [100, 400])
+def test_bursts_get_even_times(size, apart_ns, rate):
+    number = np.arange(80 * size)
+    step_ns = SECOND // rate
+    true = made.START_NS + step_ns * number
+    jitter = np.random.default_rng(1).exponential(2e6, 80).astype(np.int64)
+    stamps = true[number // size * size + size - 1] + jitter[number // size]
+    stamps = stamps + apart_ns * (number % size)
+    bursts = find_bursts(stamps)
     assert bursts is not None and bursts.size == size
-    assert bursts.rate == pytest.approx(400.0, rel=0.1)
+    assert bursts.rate == pytest.approx(rate, rel=0.1)
+    times = SampleTimes()
+    found = timed(times, stamps)
+    # All but the last burst, whose samples pass as they come, have a time.
+    assert len(found) == len(stamps) and not times.corrects and not times.is_uneven
+    errors = np.array([one.stamp_ns for one in found]) - true
+    assert np.abs(errors).max() < 8e6
+    assert np.all(np.diff([one.stamp_ns for one in found]) > 0)
+    assert np.abs(errors).max() * 1e-9 < 2.0 * found[0].doubt.common
+    # The doubt covers a driver that stamps a burst with the time of its first sample.
+    assert found[-1].doubt.common >= 0.49 * (size - 1) / rate
+
+
+def test_a_lost_burst_starts_the_line_again():
+    number = np.arange(800)
+    true = made.START_NS + 5_000_000 * number
+    stamps = true[number // 10 * 10 + 9]
+    kept = number // 10 != 47
+    found = timed(SampleTimes(), stamps[kept])
+    assert {one.stamp_ns for one in found} <= set(true.tolist())
+    assert len(found) == 790
+
+
+def test_bursts_that_begin_later_correct_the_samples_before():
+    even = made.START_NS + 5_000_000 * np.arange(200)
+    number = np.arange(800)
+    later = even[-1] + 5_000_000 * (number // 20 * 20 + 20)
+    times = SampleTimes()
+    assert len(timed(times, even)) == 200 and times.bursts is None
+    found = timed(times, later)
+    assert times.bursts is not None and times.corrects
+    assert np.diff([one.stamp_ns for one in found[-100:]]).std() < 1e4
+
+
+@pytest.mark.parametrize('kind', ['even', 'jitter', 'gaps', 'twice', 'two sensors'])
+def test_samples_of_other_streams_pass_as_they_are(kind):
+    stamps = steps_of(np.random.default_rng(5), kind)
+    times = SampleTimes()
+    found = timed(times, stamps)
+    assert [one.stamp_ns for one in found] == stamps.tolist()
+    assert not any(one.doubt.common for one in found)
+
+
+def test_a_single_sample_passes_at_the_end():
+    times = SampleTimes()
+    assert not times.add(samples_at(np.array([7]))[0])
+    assert [one.stamp_ns for one in times.rest()] == [7]
 
 
 def test_units_of_counters():

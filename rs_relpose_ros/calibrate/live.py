@@ -105,6 +105,11 @@ class LiveCalibration:
         return self._recorder.intrinsics
 
     @property
+    def warning(self) -> str:
+        """What is wrong with the stamps of the gyro, which are corrected; empty for nothing."""
+        return self._recorder.warning
+
+    @property
     def fitting(self) -> bool:
         """Whether a fit runs."""
         return self._fits is not None and self._fits.recording is not None

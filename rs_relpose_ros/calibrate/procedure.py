@@ -35,7 +35,10 @@ from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.lens import DISTORTION_MODELS, N_LENS
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.burst_times import SampleTimes
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
+from rs_relpose_ros.messages.streams import burst_warning
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -145,7 +148,11 @@ def fitted(
     progress(0.15)
 
     generator = np.random.default_rng(rng)
-    return _calibrated(about, data, R_prior, recording.focal_known, config, generator, progress)
+    found = _calibrated(about, data, R_prior, recording.focal_known, config, generator, progress)
+    # The images do not show by how much stamps of arrival are late.
+    covariance = found.final.covariance.copy()
+    covariance[model.OFFSET, model.OFFSET] += gyro.delay_sigma**2
+    return found._replace(final=replace(found.final, covariance=covariance))
 
 
 def _calibrated(
@@ -788,6 +795,7 @@ class Recorder:
         # Stamps of the images, ids and pixels (N, 2) of their points.
         self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
         self.size = (0, 0)  # of the images [px]
+        self._times = SampleTimes()
         self._gyro: dict[int, tuple[float, float, float]] = {}
         self._last_rates: tuple[float, ...] = ()  # of the last sample
         self._changed_ns = 0  # stamp of the first sample with these rates
@@ -797,6 +805,11 @@ class Recorder:
         """Time between the first and the last image."""
         frames = self._frames
         return seconds_between(frames[0][0], frames[-1][0]) if frames else 0.0
+
+    @property
+    def warning(self) -> str:
+        """What is wrong with the stamps of the gyro, which are corrected; empty for nothing."""
+        return burst_warning('the IMU', self._times)
 
     @property
     def last_ns(self) -> int:
@@ -813,8 +826,8 @@ class Recorder:
                 self.intrinsics = value
             elif value.angular_velocity is None:
                 raise MissingInputError('an IMU message has no gyro')
-            elif not self._is_held(value.stamp_ns, value.angular_velocity):
-                self._gyro.setdefault(value.stamp_ns, value.angular_velocity)
+            else:
+                self._add_gyro(value)
         except RsRelposeError as error:
             # Without a calibration the focal length is guessed.
             if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
@@ -822,6 +835,17 @@ class Recorder:
                 return None
             return error
         return None
+
+    def _add_gyro(self, sample: ImuSample) -> None:
+        """Keep the samples whose times are known by the next one."""
+        timed = self._times.add(sample)
+        if timed and self._times.corrects:
+            self._times.corrects = False
+            self._gyro.clear()
+        for one in timed:
+            rates = one.angular_velocity
+            if rates is not None and not self._is_held(one.stamp_ns, rates):
+                self._gyro.setdefault(one.stamp_ns, rates)
 
     def _is_held(self, stamp_ns: int, rates: tuple[float, float, float]) -> bool:
         """Whether a driver has repeated the last sample; its stamp would make the gyro late."""
@@ -890,7 +914,8 @@ class Recorder:
             points = intrinsics.to_sensor(points)
         frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))
         tracks = TrackedPoints(np.array(of_frames), frames, np.concatenate(ids), points)
-        gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
+        rates = np.array([self._gyro[stamp] for stamp in stamps])
+        gyro = GyroSeries(np.array(stamps), rates, self._times.delay_sigma)
         width, height = self.size
         if intrinsics is None:
             guess = _FOCAL_GUESS * max(width, height)

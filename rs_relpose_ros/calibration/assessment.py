@@ -103,11 +103,14 @@ _LITTLE_OF = 0.25
 _TRACE = 0.34
 
 
-def configured_sigmas(parameters: Parameters, from_reference: float, width: int) -> Array:
+def configured_sigmas(
+    parameters: Parameters, from_reference: float, width: int, offset_sigma: float = 0.0
+) -> Array:
     """1 sigma (K,) of the deviations by the parameters, 0 where they are not known.
 
     `from_reference` [s]: interval between frames less that to which the time offset refers.
-    `width` [px]: of the image.
+    `width` [px]: of the image. `offset_sigma` [s]: of the stamps of the gyro, which adds to the
+    sigma of the time offset.
     """
     sensor, sigmas = parameters.sensor, np.zeros(LIVE.size)
     for name, sigma in parameters.deviation_sigmas().items():
@@ -115,7 +118,7 @@ def configured_sigmas(parameters: Parameters, from_reference: float, width: int)
             sigmas[LIVE.part(name)] = sigma
     by_interval = from_reference * sensor.time_offset_per_interval_sigma
     offset = LIVE.index('time_offset')
-    sigmas[offset] = math.hypot(sigmas[offset], by_interval)
+    sigmas[offset] = math.hypot(sigmas[offset], by_interval, offset_sigma)
     return np.asarray(sigmas / LIVE.scales(width))
 
 

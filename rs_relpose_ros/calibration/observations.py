@@ -49,6 +49,7 @@ class GyroSeries:
 
     stamps_ns: NDArray[np.int64]  # (K,) IMU clock, strictly increasing
     rates: Array  # (K, 3) as measured, IMU frame [rad/s]
+    delay_sigma: float = 0.0  # 1 sigma [s] of a delay of all stamps that nothing shows
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

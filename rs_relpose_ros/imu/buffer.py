@@ -151,6 +151,17 @@ class Series:
         return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
 
 
+class StampDoubt(NamedTuple):
+    """Errors of stamps that were not given by the sensor, as 1 sigma [s]."""
+
+    common: float  # of an offset that all stamps have in common
+    varying: float  # of what changes from image to image
+
+
+# The doubt of stamps as drivers give them. [derived: the parameters contain all that is known]
+EXACT = StampDoubt(0.0, 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class ImuSample:
     """Content of one message, in the IMU frame; None for a sensor that it does not contain."""
@@ -161,6 +172,7 @@ class ImuSample:
     # Of an orientation that the IMU computes, with a covariance in the message: unit direction of
     # free fall (minus the world's z, REP-103), and its sigma per axis [rad].
     orientation: tuple[float, float, float, float] | None = None
+    doubt: StampDoubt = EXACT
 
 
 # Bounds of the mean length of the specific force over some seconds, in standard gravities: no

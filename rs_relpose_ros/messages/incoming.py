@@ -6,7 +6,7 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 """
 
 import base64
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from functools import partial
@@ -21,8 +21,9 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.burst_times import SampleTimes
 from rs_relpose_ros.messages.camera_info import intrinsics_from_info
-from rs_relpose_ros.messages.streams import check_timelines, Stream
+from rs_relpose_ros.messages.streams import burst_warning, check_timelines, Stream
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
@@ -216,11 +217,7 @@ def sensor_messages(
         for fault in check_timelines(bag.timeline, topics):
             if fault.withholds:
                 raise InputError(f'{bag.path}: {fault}')
-    streams = {
-        name: Stream(name, has_gyro=role is Role.IMU)
-        for name, (role, _) in found.items()
-        if role is not Role.TRUTH
-    }
+    streams = {name: Stream(name) for name, (role, _) in found.items() if role is not Role.TRUTH}
     for message in bag.messages([topic for _, topic in found.values()], by_stamp=True):
         role = found[message.topic][0]
         content = message.message
@@ -358,6 +355,9 @@ class Intake:
         self._held: list[images.EncodedImage] = []  # wait for the first CameraInfo
         self._last: images.EncodedImage | None = None
         self._streams: dict[Role, Stream] = {}
+        # Of the gyro, and of samples of an accelerometer without a gyro.
+        self._times = SampleTimes()
+        self._accel_times = SampleTimes()
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
 
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
@@ -370,14 +370,17 @@ class Intake:
                 self._stream(role).add(message.header)
             data = PARTS[role].read(message)
             if role is Role.IMAGE:
-                if Role.IMU in self._streams and self._streams[Role.IMU].fault:
-                    raise InputError(self._streams[Role.IMU].fault)
+                if self._times.is_uneven:
+                    raise InputError(self.warning)
                 self._add_image(data)
             elif role is Role.CAMERA_INFO:
                 self._use(data)
                 self._camera_info = message
-            elif role is Role.ACCEL or not self._gyro.repeats(data):
-                self._sequencer.add_imu(data)
+            elif data.angular_velocity is not None:
+                self._add_gyro(self._times.add(data))
+            else:
+                for sample in self._accel_times.add(data):
+                    self._sequencer.add_imu(sample)
         except RsRelposeError as error:
             if role is Role.IMAGE:
                 self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
@@ -389,8 +392,28 @@ class Intake:
 
     def _stream(self, role: Role) -> Stream:
         if role not in self._streams:
-            self._streams[role] = Stream(f'topic {role.value}', has_gyro=role is Role.IMU)
+            self._streams[role] = Stream(f'topic {role.value}')
         return self._streams[role]
+
+    @property
+    def warning(self) -> str:
+        """What is wrong with the stamps of the gyro, which are corrected; empty for nothing."""
+        return burst_warning(f'topic {Role.IMU.value}', self._times)
+
+    def _add_gyro(self, samples: Sequence[ImuSample]) -> None:
+        """Hand samples over; an error of one of them does not lose the others."""
+        if samples and self._times.corrects:
+            self._times.corrects = False
+            self._sequencer.reset('the samples of the gyro so far had the times of bursts')
+        error = None
+        for sample in samples:
+            try:
+                if not self._gyro.repeats(sample):
+                    self._sequencer.add_imu(sample)
+            except InputError as unusable:
+                error = unusable
+        if error is not None:
+            raise error
 
     def waits_for_imu(self) -> bool:
         """Whether a frame needs samples that have not been received yet."""
@@ -404,6 +427,10 @@ class Intake:
         """End of the input: no image waits for a CameraInfo any longer."""
         if self._held:
             self._use(None)
+        with suppress(InputError):  # of a stuck gyro, which has nothing to cover
+            self._add_gyro(self._times.rest())
+        for sample in self._accel_times.rest():
+            self._sequencer.add_imu(sample)
         self._sequencer.close()
 
     def _use(self, intrinsics: Intrinsics | None, problem: str = '') -> None:

@@ -24,23 +24,11 @@ from numpy.typing import NDArray
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.burst_times import Bursts, find_bursts, SampleTimes
 
 Stamps = NDArray[np.int64]
 
-# A step shorter than this share of the mean one is within a burst. [chosen: jitter of a
-# millisecond at 200 Hz makes steps of 0.6; samples read at once are stamped within a tenth]
-_WITHIN_BURST = 0.25
-# Share of such steps that makes bursts: (n - 1) / n of bursts of n samples. [chosen: 0.7 are
-# bursts of 3.4 samples; pairs of gyro and accelerometer on one topic make 0.5]
-_IN_BURSTS = 0.7
-# Smallest size of bursts. Smaller ones are a rate that has changed, or messages that overtake each
-# other. [derived: bursts of 3 samples have two short steps of three, near the share above]
-_SMALLEST_BURST = 3
-# Fewer steps are no evidence. [chosen: any value from 20 to 100 would do]
-_FEWEST_STEPS = 40
-# Longer steps are gaps and steps of a clock, not the time between bursts [ns]. [chosen: any value
-# from 0.5 s to 5 s would do]
-_GAP_NS = NANOSECONDS
 # Stamps before this time are since the start of a device, those after it since 1970 [ns].
 # [derived: 10^9 s are 2001, and 31 years of running]
 _SINCE_1970_NS = 10**9 * NANOSECONDS
@@ -58,11 +46,9 @@ _RETURNS = 2
 # Most of so many stamps must be impossible: a single one is a damaged message. [chosen: any value
 # from 3 to 20 would do]
 _FEWEST_STAMPS = 5
-# A node looks at so many stamps of a stream. [chosen: bursts of 100 need 300; any value from 300
-# to 2000 would do]
-_WINDOW = 512
-# It looks at them again after so many. [chosen: it costs 0.1 ms; 16 to 256 would do]
-_EVERY = 64
+# Share of the samples of bursts that must get even times. With fewer most images would have no
+# pose, and the user is better served by the cause. [chosen: any value from 0.3 to 0.8 would do]
+_MOST_TIMED = 0.5
 
 
 class Kind(str, Enum):
@@ -80,11 +66,7 @@ class StreamFault(NamedTuple):
     message: str
     fix: str
     measured: Mapping[str, Any]
-
-    @property
-    def withholds(self) -> bool:
-        """Whether no pose can be right."""
-        return self.kind is not Kind.ACCEL_CLOCK
+    withholds: bool = True  # whether no pose can be right
 
     def __str__(self) -> str:
         return f'{self.message}; {self.fix}'
@@ -103,40 +85,37 @@ class Timeline(NamedTuple):
         return float(np.median(self.received - self.stamps)) / NANOSECONDS
 
 
-class Bursts(NamedTuple):
-    """Samples that are stamped as they arrive, many at once."""
-
-    size: int
-    rate: float  # of the sensor [Hz]
-
-
-def find_bursts(stamps: Stamps) -> Bursts | None:
-    """Return the bursts of stamps (N,) [ns] in the order of their coming; None without bursts."""
-    steps = np.diff(stamps)
-    steps = steps[(steps >= 0) & (steps < _GAP_NS)]
-    if len(steps) < _FEWEST_STEPS or not steps.any():
-        return None
-    mean_ns = float(steps.mean())
-    within = steps < _WITHIN_BURST * mean_ns
-    starts = np.flatnonzero(~within)  # the last samples of bursts
-    if within.mean() < _IN_BURSTS or len(starts) < 3:
-        return None
-    size = float(np.median(np.diff(starts)))
-    if size < _SMALLEST_BURST:
-        return None
-    ends_ns = np.cumsum(steps)[starts]
-    return Bursts(round(size), size * NANOSECONDS / float(np.median(np.diff(ends_ns))))
-
-
-def burst_fault(topic: str, bursts: Bursts) -> StreamFault:
-    """Make the fault of a gyro in bursts."""
-    return StreamFault(
-        Kind.BURSTS,
+def burst_fault(topic: str, bursts: Bursts, sigma: float) -> StreamFault:
+    """Make the fault of a gyro in bursts; `sigma` [s]: of even times, 0 where there are none."""
+    message = (
         f'the samples of {topic} come in bursts of {bursts.size} that are stamped on arrival, '
-        f'their true rate is {bursts.rate:.0f} Hz',
-        'have the driver stamp each sample with the time of the sensor',
-        {'burst': bursts.size, 'rate_hz': bursts.rate},
+        f'their true rate is {bursts.rate:.0f} Hz'
     )
+    fix = 'have the driver stamp each sample with the time of the sensor'
+    if sigma:
+        message += f': they get even times, whose offset is known to {1e3 * sigma:.0f} ms'
+    else:
+        message += ', and they come too unevenly for even times'
+    measured = {'burst': bursts.size, 'rate_hz': bursts.rate, 'offset_sigma_s': sigma or None}
+    return StreamFault(Kind.BURSTS, message, fix, measured, withholds=not sigma)
+
+
+def burst_warning(topic: str, times: SampleTimes) -> str:
+    """Return the text on a gyro that comes in bursts; empty for a usual one."""
+    if times.bursts is None:
+        return ''
+    return str(burst_fault(topic, times.bursts, 0.0 if times.is_uneven else times.doubt.common))
+
+
+def _bursts_of(imu: Timeline) -> StreamFault | None:
+    """Return the fault of a gyro whose samples come in bursts, with what its times are worth."""
+    found = find_bursts(imu.stamps)
+    if found is None:
+        return None
+    times = SampleTimes()
+    timed = sum(len(times.add(ImuSample(int(stamp), None, None))) for stamp in imu.stamps)
+    is_even = times.bursts is not None and timed > _MOST_TIMED * len(imu.stamps)
+    return burst_fault(imu.topic, found, times.doubt.common if is_even else 0.0)
 
 
 def counter_unit(step: float, interval: float) -> str:
@@ -152,8 +131,8 @@ def stream_faults(
 ) -> list[StreamFault]:
     """Return the faults of the streams of a recording, by the stamps of all messages."""
     faults = []
-    if imu is not None and (bursts := find_bursts(imu.stamps)) is not None:
-        faults.append(burst_fault(imu.topic, bursts))
+    if imu is not None and (bursts := _bursts_of(imu)) is not None:
+        faults.append(bursts)
     if image is not None and imu is not None and len(image.stamps) and len(imu.stamps):
         faults += _since_boot(image, imu)
     if imu is not None and accel is not None and len(imu.stamps) and len(accel.stamps):
@@ -185,11 +164,14 @@ def _accel_clock(topic: str, ahead: float) -> StreamFault:
         'have its driver stamp both sensors with one clock; until then poses are from the gyro '
         'alone',
         {'ahead_s': ahead},
+        withholds=False,
     )
 
 
 # -- Repeated and interpolated samples ------------------------------------------------------------
 
+# Fewer values are no evidence. [chosen: any value from 20 to 100 would do]
+_FEWEST_VALUES = 40
 # A value that lies on the line between its neighbours within this share of the noise has been
 # interpolated. [chosen: of float32 and five digits; any value from 0.01 to 0.1 would do]
 _ON_LINE = 0.03
@@ -209,7 +191,7 @@ class Multiplied(NamedTuple):
 
 def find_multiplied(values: Array) -> Multiplied | None:
     """Return how the values (N, 3) of messages were multiplied; None for a sample in each."""
-    if len(values) < _FEWEST_STEPS or not np.ptp(values, axis=0).any():
+    if len(values) < _FEWEST_VALUES or not np.ptp(values, axis=0).any():
         return None
     steps = np.diff(values, axis=0)
     repeated: NDArray[np.bool_] = np.all(steps == 0.0, axis=1)
@@ -227,6 +209,12 @@ def find_multiplied(values: Array) -> Multiplied | None:
 # Error of the mean of an interval that is interpolated between its ends, in units of the second
 # difference of the samples there. [derived: the trapezoidal rule]
 _TRAPEZOID = 1.0 / 12.0
+
+
+# The rate of a sensor is found from so many samples. [chosen: 200 to 2000 would do]
+_WINDOW = 512
+# It is found again after so many. [chosen: it costs 0.1 ms; 16 to 256 would do]
+_EVERY = 64
 
 
 class SensorRate:
@@ -270,19 +258,13 @@ def _is_regular(multiplied: NDArray[np.bool_], factor: int) -> bool:
 
 
 class Stream:
-    """The messages of one topic as they come: publishers, stamps, bursts of a gyro.
+    """The messages of one topic as they come: publishers and stamps."""
 
-    `fault` is why poses are withheld; empty if nothing is wrong.
-    """
-
-    def __init__(self, topic: str, *, has_gyro: bool) -> None:
+    def __init__(self, topic: str) -> None:
         self.topic = topic
-        self.fault = ''
-        self._has_gyro = has_gyro
         self._frame_id: str | None = None
         self._others: list[str] = []  # frame_ids in the order of their first coming
         self._returns = self._count = self._impossible = 0
-        self._stamps: deque[int] = deque(maxlen=_WINDOW)
 
     def add(self, header: Any) -> None:
         """Add the next message by its header.
@@ -292,11 +274,6 @@ class Stream:
         """
         self._count_publishers(str(header.frame_id))
         self._count_stamps(header.stamp)
-        if self._has_gyro:
-            self._stamps.append(int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec))
-            if self._count % _EVERY == 0:
-                bursts = find_bursts(np.array(self._stamps))
-                self.fault = '' if bursts is None else str(burst_fault(self.topic, bursts))
 
     def _count_publishers(self, frame_id: str) -> None:
         if frame_id == self._frame_id:

@@ -619,7 +619,9 @@ class SensorNode(StoppableNode):
         warning = ''
         counts: Counter[str] = Counter()
         if inputs is not None:
-            warning = diagnostics.stamps_warning(inputs.stamps_ns, inputs.image_bytes)
+            warning = self._intake.warning or diagnostics.stamps_warning(
+                inputs.stamps_ns, inputs.image_bytes
+            )
             counts = inputs.counts.copy()
         source = self._calibration if self._loop is None else self._loop.sequencer
         report = self._frame_statistics.report(

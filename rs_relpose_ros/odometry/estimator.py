@@ -18,6 +18,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
+from rs_relpose_ros.messages.burst_times import SampleTimes
 from rs_relpose_ros.messages.incoming import StuckGyro
 from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.messages.streams import SensorRate
@@ -176,12 +177,13 @@ class OdometryEstimator:
         keep: bool = False,
     ) -> None:
         self._parameters, self._keep = parameters, keep
+        self._configured = parameters
+        # Times of the gyro's samples at 1, and of those of an accelerometer alone at 0.
+        self._times = SampleTimes(), SampleTimes()
+        self._offset_sigma = 0.0  # of the times [s], beyond the configured one
         self._config, self._imu = parameters.odometry, parameters.imu
         self._R_cam_body = parameters.sensor.R_cam_imu
-        # What is not known exactly about camera and IMU, as known at the next start.
-        self._doubts = Doubts(parameters)
-        self._doubted = self._doubts.prior
-        self._doubts_covariance = np.diag(np.square(self._doubts.prior_sigmas))
+        self._use_doubts(Doubts(parameters))
         self._first_R: Array | None = None  # of the body at the first start: the origin
         self.base: Base | None = Base()  # None until it is known
         if self._config.base_frame:
@@ -258,14 +260,49 @@ class OdometryEstimator:
 
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
+        has_gyro = sample.angular_velocity is not None
+        times = self._times[has_gyro]
+        timed = times.add(sample)
+        if timed and times.corrects:
+            times.corrects = False
+            self._start_again('the samples of the IMU so far had the times of bursts')
+        if timed and has_gyro and not times.doubt.common <= self._offset_sigma:
+            self._doubt_offset(times.doubt.common)
+        for one in timed:
+            self._add_timed(one)
+
+    def _start_again(self, reason: str) -> None:
+        """End the path, and forget the samples so far."""
+        newest = self._samples.both_until_ns
+        if newest is not None:
+            self._end(reason, newest)
+        self._behind = self._watched_ns = 0
+        self._samples.clear()
+        self._waiting, self._last_ns = {}, None
+
+    def _doubt_offset(self, sigma: float) -> None:
+        """Take the time offset as known to `sigma` [s] at best, for the paths that follow."""
+        if self._run is not None:
+            return  # its graph has the doubt of its start
+        self._offset_sigma = sigma
+        configured = self._configured.sensor.time_offset_sigma
+        doubted = {'time_offset_sigma': math.hypot(configured, sigma)}
+        self._parameters = self._configured.updated(doubted)
+        self._use_doubts(Doubts(self._parameters))
+
+    def _use_doubts(self, doubts: Doubts) -> None:
+        """What is not known exactly about camera and IMU, as known at the next start."""
+        self._doubts = doubts
+        self._doubted = doubts.prior
+        self._doubts_covariance = np.diag(np.square(doubts.prior_sigmas))
+
+    def _add_timed(self, sample: ImuSample) -> None:
+        """Add a sample that has its time."""
         newest = self._samples.both_until_ns
         too_late = newest is not None and sample.stamp_ns < newest - _LATE_NS
         self._behind = self._behind + 1 if too_late else 0
         if newest is not None and self._behind == _SET_BACK:
-            self._end('the clock of the IMU was set back', newest)
-            self._behind = self._watched_ns = 0
-            self._samples.clear()
-            self._waiting, self._last_ns = {}, None
+            self._start_again('the clock of the IMU was set back')
         elif too_late:
             return  # for any pair
         self._watch_rate(sample)

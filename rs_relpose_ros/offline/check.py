@@ -81,7 +81,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
         faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
         offset = None
         doubtful = sample is not None and (not sample.poses or sample.health.state is WRONG)
-        if doubtful and not faults:
+        if doubtful and not any(fault.withholds for fault in faults.values()):
             offset = _offset_of_clocks(bag, topics, scan, completion.parameters)
         findings += joint_findings(scan, sample, completion, parameters, faults, offset)
     return CheckReport(str(bag.path), with_parents(findings))
@@ -454,10 +454,14 @@ def _imu(
             )
         ]
     stamps = scan.stamps(Role.IMU)
-    rate = _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap)
     if Kind.BURSTS in faults:
-        rate = _of_fault(Code.IMU_RATE, WRONG, faults[Kind.BURSTS])
-    lines = [rate, stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU')]
+        # Steps, gaps and repeated stamps follow from the bursts.
+        bursts = faults[Kind.BURSTS]
+        state = WRONG if bursts.withholds else SUSPECT
+        lines = [_of_fault(Code.IMU_RATE, state, bursts)]
+    else:
+        rate = _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap)
+        lines = [rate, stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU')]
     if Kind.ACCEL_CLOCK in faults:
         lines.append(_of_fault(Code.ACCEL_CLOCK, SUSPECT, faults[Kind.ACCEL_CLOCK]))
     return [
@@ -681,7 +685,10 @@ def joint_findings(
     reason = reason if offset is None else 'the clocks differ'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
     found += [_not_configured(code, completion, scan) for code in sorted(missing)]
-    found += [line for line in quantity_findings(health, reason) if line.code not in missing]
+    bursts = faults.get(Kind.BURSTS)
+    doubt = bursts.measured['offset_sigma_s'] if bursts else None
+    lines = quantity_findings(health, reason, doubt or 0.0)
+    found += [line for line in lines if line.code not in missing]
     effect = _effect(scan, health, completion.parameters)
     return found if effect is None else [*found, effect]
 
@@ -839,11 +846,19 @@ def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Ass
     )
 
 
-def quantity_findings(health: Assessment, reason: str) -> Iterator[Line]:
-    """Findings on the quantities, by the sample; `reason`: why there are none."""
+def quantity_findings(
+    health: Assessment, reason: str, offset_doubt: float = 0.0
+) -> Iterator[Line]:
+    """Findings on the quantities, by the sample; `reason`: why there are none.
+
+    `offset_doubt` [s]: 1 sigma of the time offset that the stamps of the gyro leave open.
+    """
     for finding in health.findings:
         message, fix = text_of(finding)
         state = _state(finding)
+        is_offset = finding.code is Code.TIME_OFFSET and state is SUSPECT
+        if is_offset and _is_within(finding, offset_doubt):
+            state = finding.state
         further = ''
         if state is not finding.state is OK:
             further = _MEASURE
@@ -855,6 +870,13 @@ def quantity_findings(health: Assessment, reason: str) -> Iterator[Line]:
     if not health.findings:
         for quantity in QUANTITIES:
             yield Line(quantity.unknown(Why.NOT_MEASURED), f'not measured: {reason}')
+
+
+def _is_within(finding: Finding, doubt: float) -> bool:
+    """Whether a value is as certain as a doubt of this sigma lets expect."""
+    if finding.active is None or finding.estimate is None or finding.sigma is None:
+        return False
+    return abs(finding.estimate - finding.active) < _CERTAIN * math.hypot(finding.sigma, doubt)
 
 
 def _state(finding: Finding) -> FindingState:

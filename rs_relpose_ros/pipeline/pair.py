@@ -26,6 +26,7 @@ from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
 from rs_relpose_ros.geometry.timing import seconds_between, Sensor, to_nanoseconds
+from rs_relpose_ros.imu.buffer import EXACT, StampDoubt
 from rs_relpose_ros.imu.integration import (
     FrameImu,
     ImuSlice,
@@ -58,6 +59,7 @@ class Frame(Generic[Result]):
     exposure: float = 0.0  # of a row [s], over which the gyro is averaged
     applied_offset_ns: int = 0  # tracked time offset in its IMU data, beyond the parameter's
     ahead: float = 0.0  # [s] newest stamp of the gyro as the image came, less the stamped row's
+    imu_doubt: StampDoubt = EXACT  # of the stamps of the gyro, beyond the parameters
     # Images that are to be derotated have an `image` (H, W) or (H, W, C) in their own encoding.
     encoding: str = 'mono8'
     encoded: EncodedImage | None = None

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+import math
 import time
 from typing import Any, Generic
 
@@ -325,14 +326,14 @@ class Pipeline(Processor[PairResult]):
             matches,
             sensor,
             parameters,
-            stamp_sigma=stamp_sigma(self._stamps_ns),
+            stamp_sigma=math.hypot(stamp_sigma(self._stamps_ns), frame.imu_doubt.varying),
         )
         pose = self._estimated(problem, frame.stamp_ns)
         # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
-        configured = self._configured(frame.applied_offset_ns, since, sensor, parameters)
+        configured = self._configured(frame, since, sensor, parameters)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(
@@ -357,7 +358,7 @@ class Pipeline(Processor[PairResult]):
         )
 
     def _configured(
-        self, applied_offset_ns: int, since: ImuSlice, sensor: Sensor, parameters: Parameters
+        self, frame: Frame[Any], since: ImuSlice, sensor: Sensor, parameters: Parameters
     ) -> Configured:
         """The parameters of a pair, and the deviations that are applied to it."""
         bias = np.array(parameters.imu.gyro_bias)
@@ -369,10 +370,12 @@ class Pipeline(Processor[PairResult]):
             parameters.sensor,
             sensor.camera,
             bias,
-            configured_sigmas(parameters, from_reference, sensor.camera.width),
+            configured_sigmas(
+                parameters, from_reference, sensor.camera.width, frame.imu_doubt.common
+            ),
             np.zeros(LIVE.size),
         )
-        configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
+        configured.active[LIVE.index('time_offset')] = frame.applied_offset_ns / NANOSECONDS
         configured.active[LIVE.index('readout_time')] = configured.direction * self._readout
         configured.active[LIVE.part('gyro_bias')] = (
             parameters.sensor.R_cam_imu.T @ since.bias - bias

@@ -21,7 +21,14 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import timing
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
-from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample
+from rs_relpose_ros.imu.buffer import (
+    Coverage,
+    EXACT,
+    frame_imu,
+    ImuBuffer,
+    ImuSample,
+    StampDoubt,
+)
 from rs_relpose_ros.pipeline.monitor import Applied
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -111,6 +118,7 @@ class QueuedFrame:
     generation: int
     ahead: float  # [s] newest stamp of the gyro as it came, less `reference_ns`
     ready_ns: int | None = None  # None until the IMU covers its last row
+    imu_doubt: StampDoubt = EXACT  # of the stamps of its gyro samples
 
 
 class _StampOrder:
@@ -191,6 +199,7 @@ class Sequencer:
         self._previous_ns: int | None = None  # reference time of the frame taken before
         # Tracked corrections: of the time offset, and a margin around a frame [ns].
         self._offset_ns = self._margin_ns = 0
+        self._imu_doubt = EXACT  # of the last gyro sample
         # Number of jumps in time: when frames came, and as they are taken.
         self._generation = 0
         self._taken_generation = 0
@@ -220,6 +229,8 @@ class Sequencer:
                 buffer.clear()
                 last_ns = None
             added = buffer.add(sample)
+            if has_gyro:
+                self._imu_doubt = sample.doubt
             counts.imu_samples += 1
             counts.imu_repeated += not added
             if has_gyro and last_ns is not None:
@@ -281,10 +292,10 @@ class Sequencer:
         with self._changed:
             return bool(self._queue) and self._queue[-1].ready_ns is None
 
-    def reset(self) -> None:
+    def reset(self, reason: str = 'a reset was requested') -> None:
         """Drop all frames and the IMU history; tracking restarts with the next frame."""
         with self._changed:
-            self._restart(Refusal.RESET, 'a reset was requested')
+            self._restart(Refusal.RESET, reason)
             self._buffer.clear()
 
     def close(self) -> None:
@@ -330,6 +341,7 @@ class Sequencer:
                 encoded=image if self._colors else None,
                 exposure=head.exposure,
                 ahead=head.ahead,
+                imu_doubt=head.imu_doubt,
                 ready_ns=head.ready_ns or 0,
                 taken_ns=taken_ns,
             )
@@ -427,6 +439,7 @@ class Sequencer:
                     self._drop(queued, Refusal.IMU_GAP, _IMU_GAP)
                     continue
                 queued.ready_ns = now_ns
+                queued.imu_doubt = self._imu_doubt
             ready += 1
         if not self._offline:
             for _ in range(ready - MAILBOX_FRAMES):
