@@ -16,7 +16,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 from rs_relpose_lab.live.graph import Graph
 from rs_relpose_lab.live.live_cases import gray_image, pixels_of
-from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
+from rs_relpose_ros.bags.sensor_topics import (
+    CAMERA_INFO_TOPIC,
+    COMPRESSED_TOPIC,
+    IMU_TOPIC,
+    RAW_TOPIC,
+)
 from rs_relpose_ros.messages.incoming import stamp_ns
 
 SECOND = 10**9

@@ -13,7 +13,7 @@ from rs_relpose_lab.field.recording import base_recording, FieldRecording, write
 from rs_relpose_lab.live.graph import Graph
 from rs_relpose_lab.live.processes import node_process, player_process
 from rs_relpose_lab.simulation import SimulationConfig
-from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC
+from rs_relpose_ros.bags.sensor_topics import COMPRESSED_TOPIC, IMU_TOPIC
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes.inputs import message_class

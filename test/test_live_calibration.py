@@ -25,7 +25,7 @@ from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import sensor_topics
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate import live, stored
 from rs_relpose_ros.calibrate.live import LiveCalibration
@@ -283,7 +283,7 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
         'PYTHONPATH',
         os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]),
     )
-    monkeypatch.setenv('TF', f'{reader.CAMERA_FRAME} {reader.IMU_FRAME} {values}')
+    monkeypatch.setenv('TF', f'{sensor_topics.CAMERA_FRAME} {sensor_topics.IMU_FRAME} {values}')
     monkeypatch.setenv('TF_FILE', str(tmp_path / 'tf'))
     messages = faults.read_messages(bundled_bag, 1.5)
     given = {'readout_time': 0.03, 'calibrate_at_start': 'never', 'image_transport': 'raw'}
@@ -292,10 +292,11 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
         node.wait_for('waiting for the first image')
         publishers = faults.drivers(graph)
         faults.play(publishers, messages)
-        node.wait_for(f'on /tf_static: "{reader.IMU_FRAME}"')
+        node.wait_for(f'on /tf_static: "{sensor_topics.IMU_FRAME}"')
         (tmp_path / 'tf').touch()
         node.wait_for(
-            f'from /tf_static, {reader.IMU_FRAME} in {reader.CAMERA_FRAME}: quat_cam_imu_xyzw'
+            f'from /tf_static, {sensor_topics.IMU_FRAME} in {sensor_topics.CAMERA_FRAME}: '
+            'quat_cam_imu_xyzw'
         )
         wait_until(lambda: node.output.count('ready:') == 1, 'a start', node)
         faults.play(publishers, messages, later=100.0)
@@ -371,7 +372,7 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
     start = {
         'parameters': {
             'image_transport': 'compressed',
-            **faults.reliable(reader.COMPRESSED_TOPIC, reader.IMU_TOPIC),
+            **faults.reliable(sensor_topics.COMPRESSED_TOPIC, sensor_topics.IMU_TOPIC),
         },
         'remap': faults.BAG_TOPICS,
     }

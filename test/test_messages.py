@@ -21,7 +21,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 from simulated_pairs import simulated_flight
 
-from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMU_FRAME, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.sensor_topics import CAMERA_FRAME, IMU_FRAME
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibration.findings import Assessment, Code, Finding, FindingState, Why
 from rs_relpose_ros.cli import main as command_line

@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.experiments import live, live_clip
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, Process, wait_until
-from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.sensor_topics import COMPRESSED_TOPIC, IMU_TOPIC
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns

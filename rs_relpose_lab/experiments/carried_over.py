@@ -15,7 +15,8 @@ from rs_relpose_lab.experiments.consistency import (
     policy_pairs,
 )
 from rs_relpose_lab.experiments.true_pairs import read_truth, TruePath
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.sensor_topics import COMPRESSED_IMAGE
 from rs_relpose_ros.calibrate.procedure import (
     calibrate_together,
     CalibrationInput,

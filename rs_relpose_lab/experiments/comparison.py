@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import methods
-from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, open_bag
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import MissingInputError

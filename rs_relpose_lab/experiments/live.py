@@ -20,7 +20,7 @@ from rs_relpose_lab.experiments import live_clip
 from rs_relpose_lab.experiments.harness import markdown_table, write_csv, write_table
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.live.processes import ProcessMetrics
-from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
+from rs_relpose_ros.bags.sensor_topics import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array

@@ -20,7 +20,7 @@ from rs_relpose_lab.simulation.bag import (
 )
 from rs_relpose_lab.simulation.motions import EYE_HEIGHT
 from rs_relpose_lab.simulation.trajectory import DEGREE, Trajectory
-from rs_relpose_ros.bags.reader import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
+from rs_relpose_ros.bags.sensor_topics import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds

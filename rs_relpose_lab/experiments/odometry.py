@@ -23,7 +23,7 @@ from rs_relpose_lab.experiments.trust_runs import Recording, Source
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import intrinsics_of
 from rs_relpose_lab.simulation.scene import SCENES
-from rs_relpose_ros.bags.reader import IMAGE_DELAY
+from rs_relpose_ros.bags.sensor_topics import IMAGE_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import Array

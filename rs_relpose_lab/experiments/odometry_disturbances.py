@@ -22,7 +22,7 @@ from rs_relpose_lab.experiments.trust_runs import Recording
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_lab.simulation.simulation import Simulation
-from rs_relpose_ros.bags.reader import IMU_DELAY
+from rs_relpose_ros.bags.sensor_topics import IMU_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array

@@ -21,7 +21,8 @@ from rs_relpose_lab.simulation.render import view_of
 from rs_relpose_lab.simulation.rows import observe
 from rs_relpose_lab.simulation.simulation import Simulation
 from rs_relpose_lab.simulation.trajectory import FinePath
-from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.sensor_topics import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.geometry import Array

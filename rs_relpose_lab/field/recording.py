@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import jpeg, render_once, right_parameters
 from rs_relpose_lab.simulation.trajectory import CameraStates
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import sensor_topics
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config import files as parameter_file
@@ -129,9 +129,9 @@ def base_recording(config: SimulationConfig, folder: Path) -> FieldRecording:
     """The recording of a configuration; its images are rendered into `folder` once."""
     bag_path, _ = render_once(config, folder)
     simulation = simulate(config)
-    delay_ns = to_nanoseconds(config.readout_time + reader.IMAGE_DELAY)
+    delay_ns = to_nanoseconds(config.readout_time + sensor_topics.IMAGE_DELAY)
     with open_bag(bag_path) as bag:
-        topics = [topic for topic in bag.topics if topic.name == reader.COMPRESSED_TOPIC]
+        topics = [topic for topic in bag.topics if topic.name == sensor_topics.COMPRESSED_TOPIC]
         images = [bytes(message.message.data) for message in bag.messages(topics)]
     shots = tuple(
         Shot(
@@ -143,7 +143,7 @@ def base_recording(config: SimulationConfig, folder: Path) -> FieldRecording:
         for number, data in enumerate(images)
     )
     imu = simulation.imu
-    receive_ns = imu.stamps_ns + to_nanoseconds(reader.IMU_DELAY)
+    receive_ns = imu.stamps_ns + to_nanoseconds(sensor_topics.IMU_DELAY)
     return FieldRecording(
         shots=shots,
         imu=Samples(
@@ -151,7 +151,7 @@ def base_recording(config: SimulationConfig, folder: Path) -> FieldRecording:
             receive_ns,
             imu.angular_velocities,
             imu.linear_accelerations,
-            (reader.IMU_FRAME,),
+            (sensor_topics.IMU_FRAME,),
         ),
         accel=None,
         camera=simulation.camera,
@@ -173,7 +173,7 @@ def write_recording(recording: FieldRecording, bag_path: Path) -> Path:
     with BagWriter(bag_path) as bag:
         series = [
             _image_entries(recording, bag),
-            _imu_entries(recording.imu, reader.IMU_TOPIC, bag),
+            _imu_entries(recording.imu, sensor_topics.IMU_TOPIC, bag),
             _truth_entries(recording, bag),
         ]
         if recording.accel is not None:
@@ -189,15 +189,20 @@ def write_recording(recording: FieldRecording, bag_path: Path) -> Path:
 def _image_entries(recording: FieldRecording, bag: BagWriter) -> Any:
     for shot in sorted(recording.shots, key=lambda one: one.receive_ns):
         info = outgoing.camera_info_message(
-            shot.stamp_ns, reader.CAMERA_FRAME, recording.camera, None, bag.type
+            shot.stamp_ns, sensor_topics.CAMERA_FRAME, recording.camera, None, bag.type
         )
         for name, value in recording.info_fields.items():
             setattr(info, name, value)
-        yield shot.receive_ns, reader.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
+        yield shot.receive_ns, sensor_topics.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         image = outgoing.encoded_image_message(
-            shot.stamp_ns, reader.CAMERA_FRAME, shot.data, bag.type
+            shot.stamp_ns, sensor_topics.CAMERA_FRAME, shot.data, bag.type
         )
-        yield shot.receive_ns, reader.COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage', image
+        yield (
+            shot.receive_ns,
+            sensor_topics.COMPRESSED_TOPIC,
+            'sensor_msgs/msg/CompressedImage',
+            image,
+        )
 
 
 def _imu_entries(samples: Samples, topic: str, bag: BagWriter) -> Any:
@@ -221,7 +226,12 @@ def _truth_entries(recording: FieldRecording, bag: BagWriter) -> Any:
         stamps_ns.tolist(), states.position, rotations.as_quat(), strict=True
     ):
         message = outgoing.pose_stamped_message(
-            stamp_ns, reader.WORLD_FRAME, quat_xyzw, position, bag.type
+            stamp_ns, sensor_topics.WORLD_FRAME, quat_xyzw, position, bag.type
         )
-        receive_ns = stamp_ns + to_nanoseconds(reader.IMU_DELAY)
-        yield receive_ns, reader.GROUND_TRUTH_TOPIC, 'geometry_msgs/msg/PoseStamped', message
+        receive_ns = stamp_ns + to_nanoseconds(sensor_topics.IMU_DELAY)
+        yield (
+            receive_ns,
+            sensor_topics.GROUND_TRUTH_TOPIC,
+            'geometry_msgs/msg/PoseStamped',
+            message,
+        )

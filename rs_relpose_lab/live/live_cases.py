@@ -27,7 +27,7 @@ from rs_relpose_lab.live.graph import Graph, private_domain
 from rs_relpose_lab.live.processes import node_process
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.bag import render_once
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import reader, sensor_topics
 from rs_relpose_ros.config.files import file_values
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import stamp_ns
@@ -310,9 +310,9 @@ def _messages(bag: Path, case: Case) -> list[tuple[float, Any]]:
         first_ns, image = 0, -1
         for raw in opened.raw_messages(opened.topics):
             kind = {
-                reader.COMPRESSED_IMAGE: CompressedImage,
-                reader.CAMERA_INFO: CameraInfo,
-                reader.IMU: Imu,
+                sensor_topics.COMPRESSED_IMAGE: CompressedImage,
+                sensor_topics.CAMERA_INFO: CameraInfo,
+                sensor_topics.IMU: Imu,
             }.get(raw.msgtype)
             if kind is None:
                 continue

@@ -28,7 +28,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CompressedImage, Image
 
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import reader, sensor_topics
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.nodes.inputs import message_class
@@ -39,7 +39,7 @@ from rs_relpose_ros.nodes.inputs import message_class
 # std_msgs/Header at the begin of the message.
 _STAMP = slice(4, 12)
 _TAIL_NS = NANOSECONDS // 20
-_IMAGES = (reader.IMAGE, reader.COMPRESSED_IMAGE)
+_IMAGES = (sensor_topics.IMAGE, sensor_topics.COMPRESSED_IMAGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ LOG_DTYPE = np.dtype(
 )
 
 # Types that the node subscribes to: the player waits for these subscriptions.
-_SENSOR_TYPES = (*_IMAGES, reader.CAMERA_INFO, reader.IMU)
+_SENSOR_TYPES = (*_IMAGES, sensor_topics.CAMERA_INFO, sensor_topics.IMU)
 _DEPTH = 1000
 # Between the match on the publisher's side and that on the subscriber's, messages are lost [s].
 _SETTLE = 0.5
@@ -146,7 +146,7 @@ def play(node: Node, options: argparse.Namespace) -> int:
         return _publish(messages, publishers, options)
 
 
-def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[reader.Topic]:
+def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[sensor_topics.Topic]:
     there = {topic.name for topic in bag.topics}
     for name in options.topics:
         if name not in there:
@@ -156,10 +156,10 @@ def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[reader.Topic]:
     return [topic for topic in bag.topics if not options.topics or topic.name in options.topics]
 
 
-def _publisher(node: Node, topic: reader.Topic, options: argparse.Namespace) -> Publisher:
+def _publisher(node: Node, topic: sensor_topics.Topic, options: argparse.Namespace) -> Publisher:
     name, msgtype = topic.name, topic.msgtype
-    if options.decode and msgtype == reader.COMPRESSED_IMAGE:
-        name, msgtype = name.removesuffix('/compressed'), reader.IMAGE
+    if options.decode and msgtype == sensor_topics.COMPRESSED_IMAGE:
+        name, msgtype = name.removesuffix('/compressed'), sensor_topics.IMAGE
     reliability = (
         ReliabilityPolicy.BEST_EFFORT if options.best_effort else ReliabilityPolicy.RELIABLE
     )
@@ -168,7 +168,7 @@ def _publisher(node: Node, topic: reader.Topic, options: argparse.Namespace) -> 
         name,
         QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
-            depth=_DEPTH if msgtype == reader.IMU else 10,
+            depth=_DEPTH if msgtype == sensor_topics.IMU else 10,
             reliability=reliability,
         ),
     )
@@ -197,14 +197,14 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], least: int, seconds: 
 
 
 def _outgoing(
-    bag: reader.Bag, topics: Sequence[reader.Topic], options: argparse.Namespace
+    bag: reader.Bag, topics: Sequence[sensor_topics.Topic], options: argparse.Namespace
 ) -> Iterator[Outgoing]:
     first_ns: int | None = None
     for raw in bag.raw_messages(topics):
         first_ns = raw.bag_time_ns if first_ns is None else first_ns
         data = bytes(raw.data)
-        if options.decode and raw.msgtype == reader.COMPRESSED_IMAGE:
-            compressed = deserialize_message(data, message_class(reader.COMPRESSED_IMAGE))
+        if options.decode and raw.msgtype == sensor_topics.COMPRESSED_IMAGE:
+            compressed = deserialize_message(data, message_class(sensor_topics.COMPRESSED_IMAGE))
             data = bytes(serialize_message(_decoded(compressed, options.decode)))
         yield Outgoing(raw.bag_time_ns - first_ns, raw.topic, raw.msgtype, data)
 
@@ -245,8 +245,10 @@ def _publish(
         now_ns = time.monotonic_ns()
         publishers[message.topic].publish(message.data)
         count += 1
-        if options.log is not None and message.msgtype in (*_IMAGES, reader.IMU):
-            log.append((message.msgtype != reader.IMU, stamp_of(message.data), due_ns, now_ns))
+        if options.log is not None and message.msgtype in (*_IMAGES, sensor_topics.IMU):
+            log.append(
+                (message.msgtype != sensor_topics.IMU, stamp_of(message.data), due_ns, now_ns)
+            )
     if options.log is not None:
         np.save(options.log, np.array(log, dtype=LOG_DTYPE))
     if rclpy.ok():

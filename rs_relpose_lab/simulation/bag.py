@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.simulation.config import SimulationConfig
 from rs_relpose_lab.simulation.simulation import simulate, Simulation
 from rs_relpose_lab.simulation.trajectory import Trajectory
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import sensor_topics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config import files as parameter_file
 from rs_relpose_ros.config.files import SourcedValue
@@ -48,17 +48,17 @@ def write_bag(
     def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
         if raw:
             return (
-                reader.RAW_TOPIC,
+                sensor_topics.RAW_TOPIC,
                 'sensor_msgs/msg/Image',
                 outgoing.image_message(
-                    stamp_ns, reader.CAMERA_FRAME, Pixels(pixels, 'mono8'), bag.type
+                    stamp_ns, sensor_topics.CAMERA_FRAME, Pixels(pixels, 'mono8'), bag.type
                 ),
             )
         return (
-            reader.COMPRESSED_TOPIC,
+            sensor_topics.COMPRESSED_TOPIC,
             'sensor_msgs/msg/CompressedImage',
             outgoing.encoded_image_message(
-                stamp_ns, reader.CAMERA_FRAME, jpeg(pixels, jpeg_quality), bag.type
+                stamp_ns, sensor_topics.CAMERA_FRAME, jpeg(pixels, jpeg_quality), bag.type
             ),
         )
 
@@ -66,8 +66,12 @@ def write_bag(
         images = image_entries(simulation, bag, encode, on_frame)
         write_in_order(
             bag,
-            (entry for entry in images if camera_info or entry[1] != reader.CAMERA_INFO_TOPIC),
-            imu_entries(simulation, bag, reader.IMU_TOPIC),
+            (
+                entry
+                for entry in images
+                if camera_info or entry[1] != sensor_topics.CAMERA_INFO_TOPIC
+            ),
+            imu_entries(simulation, bag, sensor_topics.IMU_TOPIC),
             _truth_entries(simulation, bag),
         )
 
@@ -160,14 +164,19 @@ def image_entries(
     on_frame: Callable[[], object],
 ) -> Iterator[Entry]:
     """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
-    delay_ns = to_nanoseconds(simulation.config.readout_time + reader.IMAGE_DELAY)
+    delay_ns = to_nanoseconds(simulation.config.readout_time + sensor_topics.IMAGE_DELAY)
     for index in range(simulation.config.frame_count):
         stamp_ns = simulation.stamp_ns(index)
         topic, msgtype, message = encode(stamp_ns, simulation.image(index))
         info = outgoing.camera_info_message(
-            stamp_ns, reader.CAMERA_FRAME, simulation.camera, None, bag.type
+            stamp_ns, sensor_topics.CAMERA_FRAME, simulation.camera, None, bag.type
         )
-        yield stamp_ns + delay_ns, reader.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
+        yield (
+            stamp_ns + delay_ns,
+            sensor_topics.CAMERA_INFO_TOPIC,
+            'sensor_msgs/msg/CameraInfo',
+            info,
+        )
         yield stamp_ns + delay_ns, topic, msgtype, message
         on_frame()
 
@@ -183,12 +192,12 @@ def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[
         imu.stamps_ns.tolist(), imu.angular_velocities, imu.linear_accelerations, strict=True
     ):
         yield (
-            stamp_ns + to_nanoseconds(reader.IMU_DELAY),
+            stamp_ns + to_nanoseconds(sensor_topics.IMU_DELAY),
             topic,
             'sensor_msgs/msg/Imu',
             outgoing.imu_message(
                 stamp_ns,
-                reader.IMU_FRAME,
+                sensor_topics.IMU_FRAME,
                 rate,
                 force,
                 bag.type,
@@ -208,10 +217,10 @@ def _truth_entries(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
         stamps_ns.tolist(), states.position, quaternions, strict=True
     ):
         yield (
-            stamp_ns + to_nanoseconds(reader.IMU_DELAY),
-            reader.GROUND_TRUTH_TOPIC,
+            stamp_ns + to_nanoseconds(sensor_topics.IMU_DELAY),
+            sensor_topics.GROUND_TRUTH_TOPIC,
             'geometry_msgs/msg/PoseStamped',
             outgoing.pose_stamped_message(
-                stamp_ns, reader.WORLD_FRAME, quat_xyzw, position, bag.type
+                stamp_ns, sensor_topics.WORLD_FRAME, quat_xyzw, position, bag.type
             ),
         )

@@ -4,8 +4,9 @@ Records and their fields: https://mcap.dev/spec. All numbers are little-endian.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
+import functools
 import os
 from pathlib import Path
 import struct
@@ -13,6 +14,7 @@ from typing import BinaryIO, NamedTuple
 import zlib
 
 from rs_relpose_ros.bags.storage import (
+    BEGIN_BYTES,
     chunk_data,
     DamagedError,
     Entry,
@@ -22,6 +24,7 @@ from rs_relpose_ros.bags.storage import (
     read_exactly,
     Source,
     StoredTopic,
+    ZSTD_MAGIC,
 )
 
 # The first record names profile and library. Kinds and layouts of records are those of the
@@ -59,6 +62,11 @@ _END = struct.Struct('<BQQQI8s')
 _LENGTH = struct.Struct('<I')
 # The data of a chunk begin with their size. [derived: MCAP]
 _SIZE = struct.Struct('<Q')
+# Name of no compression; an empty name means the same. [derived: MCAP]
+_PLAIN = b'none'
+# Bytes that are read at once where only the begins of messages are needed. Less takes more calls
+# for small messages, more reads the pixels of images, too. [chosen: 4 to 64 kB would do]
+_BLOCK_BYTES = 1 << 14
 # Bytes of the longest name of a compression that is read with the head of a chunk. A shorter one
 # would refuse a name, a longer one reads more for nothing. [chosen: known names have four letters]
 _MAX_NAME = 64
@@ -77,6 +85,7 @@ class McapStorage:
     def __init__(self, path: Path, stack: ExitStack) -> None:
         self._file = stack.enter_context(path.open('rb', buffering=0))
         self._chunks = KeptChunks(self._load_chunk)
+        self._compared: set[int] = set()  # chunks whose checksums were right
         self._schemas: dict[int, tuple[str, bytes]] = {}
         self._channels: dict[int, _Channel] = {}
         self._counts: Counter[int] = Counter()
@@ -91,12 +100,13 @@ class McapStorage:
         """All messages in the order of the file."""
         for kind, start, size in self._records(len(Source.MCAP.value), self._end):
             if kind == _CHUNK:
-                chunk = memoryview(self._chunks[start])
-                for inner, offset, length in _records_of(chunk):
-                    record = chunk[offset : offset + length]
-                    yield from self._entry(inner, record, start, offset)
-            elif kind in (_SCHEMA, _CHANNEL, _MESSAGE):
-                yield from self._entry(kind, self._read(start, size), start, -1)
+                yield from self._entries_of(start, size)
+            elif kind == _MESSAGE:
+                begin = self._read(start, min(size, _MESSAGE_HEAD.size + BEGIN_BYTES))
+                whole = functools.partial(self._read, start, size)
+                yield self._entry(begin, whole, start, -1)
+            elif kind in (_SCHEMA, _CHANNEL):
+                self._describe(kind, self._read(start, size))
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""
@@ -105,21 +115,47 @@ class McapStorage:
             return self._read(place, size)[_MESSAGE_HEAD.size :]
         chunk = self._chunks[place]
         _, size = _HEAD.unpack_from(chunk, offset - _HEAD.size)
-        return chunk[offset + _MESSAGE_HEAD.size : offset + size]
+        return bytes(chunk[offset + _MESSAGE_HEAD.size : offset + size])
+
+    def _entries_of(self, place: int, size: int) -> Iterator[Entry]:
+        """The entries of a chunk in the file."""
+        plain = self._plain_records(place, size)
+        window = _Window(self._file, *plain) if plain else _Window.of(self._chunks[place])
+        for kind, offset, length in window.records():
+            if kind == _MESSAGE:
+                begin = window.bytes(offset, min(length, _MESSAGE_HEAD.size + BEGIN_BYTES))
+                whole = functools.partial(window.bytes, offset, length)
+                yield self._entry(begin, whole, place, offset)
+            elif kind in (_SCHEMA, _CHANNEL):
+                self._describe(kind, bytes(window.bytes(offset, length)))
+
+    def _plain_records(self, place: int, size: int) -> tuple[int, int] | None:
+        """Place and size of the records of a chunk that is not compressed; None of another."""
+        head = self._read(place, min(size, _CHUNK_HEAD.size + len(_PLAIN) + _SIZE.size))
+        _, _, content, _, length = _CHUNK_HEAD.unpack_from(head)
+        if length > len(_PLAIN) or head[_CHUNK_HEAD.size :][:length] not in (b'', _PLAIN):
+            return None
+        (stored,) = _SIZE.unpack_from(head, _CHUNK_HEAD.size + length)
+        start = _CHUNK_HEAD.size + length + _SIZE.size
+        if stored != content or stored > size - start:
+            raise DamagedError('a chunk is not as large as its head says')
+        return place + start, stored
 
     def _entry(
-        self, kind: int, record: bytes | memoryview, place: int, offset: int
-    ) -> Iterator[Entry]:
-        """The entry of a message; a schema or a channel is kept."""
-        if kind == _MESSAGE:
-            channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(record)
-            if channel not in self._channels:
-                raise DamagedError(
-                    f'a message belongs to channel {channel}, which is not described'
-                )
-            yield Entry(channel, time_ns, place, offset, record[_MESSAGE_HEAD.size :])
-        elif kind in (_SCHEMA, _CHANNEL):
-            self._describe(kind, bytes(record))
+        self,
+        begin: bytes | memoryview,
+        whole: Callable[[], bytes | memoryview],
+        place: int,
+        offset: int,
+    ) -> Entry:
+        """The entry of a message, by the begin of its record or by all of it."""
+        channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(begin)
+        if channel not in self._channels:
+            raise DamagedError(f'a message belongs to channel {channel}, which is not described')
+        content = begin[_MESSAGE_HEAD.size :]
+        if content[:4] == ZSTD_MAGIC:
+            content = whole()[_MESSAGE_HEAD.size :]
+        return Entry(channel, time_ns, place, offset, content)
 
     def _read(self, start: int, size: int) -> bytes:
         return read_exactly(self._file, start, size)
@@ -208,14 +244,58 @@ class McapStorage:
                 return
             start += size
 
-    def _load_chunk(self, start: int) -> bytes:
-        """The records of a chunk, decompressed."""
+    def _load_chunk(self, start: int) -> bytes | memoryview:
+        """The records of a chunk, decompressed; its checksum is compared the first time."""
         _, size = _HEAD.unpack(self._read(start - _HEAD.size, _HEAD.size))
-        return chunk_content(self._read(start, size))
+        is_new = start not in self._compared
+        self._compared.add(start)
+        return chunk_content(self._read(start, size), compared=is_new)
 
 
-def chunk_content(record: bytes) -> bytes:
-    """The records in the record of a chunk, decompressed; DamagedError if they are not intact."""
+class _Window:
+    """Reads parts of some bytes of a file at growing places, a block at once."""
+
+    def __init__(self, file: BinaryIO | None, start: int, size: int) -> None:
+        self._file = file
+        self._start = start
+        self._size = size
+        self._block: bytes | memoryview = b''
+        self._begin = 0  # of the block
+
+    @classmethod
+    def of(cls, content: bytes | memoryview) -> '_Window':
+        """Make a window of bytes in memory."""
+        window = cls(None, 0, len(content))
+        window._block = memoryview(content)
+        return window
+
+    def bytes(self, place: int, count: int) -> bytes | memoryview:
+        """Bytes at a place after the start."""
+        at = place - self._begin
+        if self._file is not None and not (0 <= at and at + count <= len(self._block)):
+            largest = max(count, min(_BLOCK_BYTES, self._size - place))
+            self._block = read_exactly(self._file, self._start + place, largest)
+            self._begin = place
+            at = 0
+        return self._block[at : at + count]
+
+    def records(self) -> Iterator[tuple[int, int, int]]:
+        """Kind, start and size of all records."""
+        start = 0
+        while start < self._size:
+            kind, size = _HEAD.unpack(self.bytes(start, _HEAD.size))
+            start += _HEAD.size
+            if size > self._size - start:
+                raise DamagedError('a record ends beyond its chunk')
+            yield kind, start, size
+            start += size
+
+
+def chunk_content(record: bytes, *, compared: bool = True) -> bytes | memoryview:
+    """The records in the record of a chunk, decompressed; DamagedError if they are not intact.
+
+    `compared`: whether their checksum is compared.
+    """
     _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(record)
     if length > _MAX_NAME:
         raise DamagedError('a chunk has an unknown compression')
@@ -225,8 +305,8 @@ def chunk_content(record: bytes) -> bytes:
     begin = end_of_name + _SIZE.size
     if stored > len(record) - begin:
         raise DamagedError('a field ends beyond its record')
-    chunk = chunk_data(record[begin : begin + stored], name, size)
-    if checksum and zlib.crc32(chunk) != checksum:
+    chunk = chunk_data(memoryview(record)[begin : begin + stored], name, size)
+    if compared and checksum and zlib.crc32(chunk) != checksum:
         raise DamagedError('the checksum of a chunk is wrong')
     return chunk
 
@@ -247,7 +327,7 @@ def intact_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             yield kind, record
         elif kind == _CHUNK:
             with suppress(Exception):  # damaged bytes can raise anything in the decompressors
-                for _ in _records_of(memoryview(chunk_content(record))):
+                for _ in _Window.of(chunk_content(record)).records():
                     pass
                 yield kind, record
 
@@ -260,18 +340,6 @@ def write_records(file: BinaryIO, records: Iterable[tuple[int, bytes]]) -> None:
         file.write(_HEAD.pack(kind, len(record)) + record)
     size = _END.size - _HEAD.size - len(magic)
     file.write(_END.pack(_FOOTER, size, 0, 0, 0, magic))
-
-
-def _records_of(chunk: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Kind, start and size of the records in a chunk."""
-    start = 0
-    while start < len(chunk):
-        kind, size = _HEAD.unpack_from(chunk, start)
-        start += _HEAD.size
-        if size > len(chunk) - start:
-            raise DamagedError('a record ends beyond its chunk')
-        yield kind, start, size
-        start += size
 
 
 class _Fields:

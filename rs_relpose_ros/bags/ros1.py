@@ -17,6 +17,7 @@ from rosbags.interfaces import (
 )
 
 from rs_relpose_ros.bags.storage import (
+    BEGIN_BYTES,
     chunk_data,
     DamagedError,
     Entry,
@@ -103,14 +104,14 @@ class Ros1Storage:
                 (connection,) = _LENGTH.unpack(fields['conn'])
                 if connection not in known:
                     raise DamagedError(f'a message belongs to the unknown connection {connection}')
-                content = memoryview(chunk)[data:start]
+                content = memoryview(chunk)[data : min(start, data + BEGIN_BYTES)]
                 yield Entry(connection, _nanoseconds(fields['time']), place, data, content)
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""
         chunk = self._chunks[place]
         (size,) = _LENGTH.unpack_from(chunk, offset - _LENGTH.size)
-        return chunk[offset : offset + size]
+        return bytes(chunk[offset : offset + size])
 
     def _read(self, start: int, size: int) -> bytes:
         return read_exactly(self._file, start, size)
@@ -159,7 +160,7 @@ class Ros1Storage:
             (LATCHED,) if connection.get('latching') == b'1' else (),
         )
 
-    def _load_chunk(self, start: int) -> bytes:
+    def _load_chunk(self, start: int) -> bytes | memoryview:
         fields, data, size = self._record(start)
         if fields['op'][0] != _CHUNK:
             raise DamagedError('its index names a chunk where there is none')
@@ -167,7 +168,7 @@ class Ros1Storage:
         return chunk_data(self._read(data, size), fields['compression'].decode(), whole)
 
 
-def _record_of(chunk: bytes, start: int) -> tuple[dict[str, bytes], int, int]:
+def _record_of(chunk: bytes | memoryview, start: int) -> tuple[dict[str, bytes], int, int]:
     """Fields of the header of a record in a chunk, and start and end of its data."""
     (length,) = _LENGTH.unpack_from(chunk, start)
     header = start + _LENGTH.size
@@ -177,7 +178,7 @@ def _record_of(chunk: bytes, start: int) -> tuple[dict[str, bytes], int, int]:
     end = data + size
     if end > len(chunk):
         raise DamagedError('a record ends beyond its chunk')
-    return _fields(chunk[header:end_of_header]), data, end
+    return _fields(bytes(chunk[header:end_of_header])), data, end
 
 
 def _fields(header: bytes) -> dict[str, bytes]:

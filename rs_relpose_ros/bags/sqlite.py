@@ -6,11 +6,21 @@ from pathlib import Path
 import sqlite3
 from urllib.parse import quote
 
-from rs_relpose_ros.bags.storage import DamagedError, Entry, qos_profiles, StoredTopic
+from rs_relpose_ros.bags.storage import (
+    BEGIN_BYTES,
+    DamagedError,
+    Entry,
+    qos_profiles,
+    StoredTopic,
+    ZSTD_MAGIC,
+)
 
 # First bytes of a write-ahead log, in both byte orders. SQLite takes a log that begins otherwise
 # for an empty one. [derived: its file format]
 _LOG_MAGIC = (0x377F0682, 0x377F0683)
+# Bytes of a message up to which it is read as a whole, and not by its begin. [chosen: about a page
+# of SQLite; 1 to 16 kB would do]
+_SMALL_BYTES = 4096
 
 
 class SqliteStorage:
@@ -41,12 +51,23 @@ class SqliteStorage:
 
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""
-        query = 'SELECT topic_id, timestamp, id, data FROM messages ORDER BY id'
-        with closing(self._base.execute(query)) as rows:
-            for topic_id, time_ns, row, data in rows:
-                if not isinstance(data, bytes):
+        # Of a large message SQLite reads all pages that a query names.
+        query = (
+            'SELECT topic_id, timestamp, id, typeof(data), '
+            'CASE WHEN length(data) <= ? THEN data END FROM messages ORDER BY id'
+        )
+        with closing(self._base.execute(query, (_SMALL_BYTES,))) as rows:
+            for topic_id, time_ns, row, kind, data in rows:
+                if kind != 'blob':
                     raise DamagedError('a message has no bytes')
-                yield Entry(int(topic_id), int(time_ns), int(row), 0, data)
+                begin = self._begin(int(row)) if data is None else data
+                yield Entry(int(topic_id), int(time_ns), int(row), 0, begin)
+
+    def _begin(self, row: int) -> bytes:
+        """The bytes that a large message begins with; all where they are compressed."""
+        with self._base.blobopen('messages', 'data', row, readonly=True) as blob:
+            begin = blob.read(BEGIN_BYTES)
+            return begin + blob.read() if begin[:4] == ZSTD_MAGIC else begin
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""

@@ -43,6 +43,9 @@ MAX_MESSAGE_BYTES = 1 << 29
 # chunks again where topics lie far apart in the file; more only take memory. [chosen: 10 to 500
 # MB]
 _KEPT_BYTES = 1 << 27
+# Bytes of a message that an index needs: its stamp is in them. [derived: CDR has it in the first
+# 12 bytes; a larger number reads more for nothing]
+BEGIN_BYTES = 64
 # First bytes of data that are compressed by zstd. A message as CDR begins with a zero instead.
 # [derived: the format of zstd]
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -73,13 +76,13 @@ class StoredTopic(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A message in a file: two numbers that find it again, and its bytes."""
+    """A message in a file: two numbers that find it again, and the bytes that it begins with."""
 
     topic_id: int
     time_ns: int  # when it was recorded
     place: int
     offset: int
-    data: bytes | memoryview
+    begin: bytes | memoryview  # `BEGIN_BYTES` or more, or all; all where it is compressed itself
 
 
 class Storage(Protocol):
@@ -99,7 +102,7 @@ class Storage(Protocol):
         """Bytes of the message of an entry."""
 
 
-def decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:
+def decompressed(decompressor: Callable[[], Any], data: bytes | memoryview, limit: int) -> bytes:
     """Decompress one frame of at most `limit` bytes."""
     stream = decompressor()
     # One byte more: at exactly the limit the end of the frame may not be reached.
@@ -119,9 +122,10 @@ _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
 }
 
 
-def chunk_data(data: bytes, compression: str, size: int) -> bytes:
+def chunk_data(data: bytes | memoryview, compression: str, size: int) -> bytes | memoryview:
     """Content of a chunk that has `size` bytes by its head."""
     limit = min(size, MAX_CHUNK_BYTES)
+    out: bytes | memoryview
     if compression in ('', 'none'):
         out = data
     elif compression in _DECOMPRESSORS:
@@ -162,12 +166,12 @@ def first_bytes(data: bytes | memoryview, count: int) -> bytes:
 class KeptChunks:
     """The last chunks that were decompressed, by their place."""
 
-    def __init__(self, load: Callable[[int], bytes]) -> None:
+    def __init__(self, load: Callable[[int], bytes | memoryview]) -> None:
         self._load = load
-        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._chunks: OrderedDict[int, bytes | memoryview] = OrderedDict()
         self._size = 0
 
-    def __getitem__(self, place: int) -> bytes:
+    def __getitem__(self, place: int) -> bytes | memoryview:
         if place not in self._chunks:
             self._chunks[place] = self._load(place)
             self._size += len(self._chunks[place])

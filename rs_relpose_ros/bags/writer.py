@@ -9,7 +9,8 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from rs_relpose_ros.bags.reader import RawMessage, Topic
+from rs_relpose_ros.bags.reader import RawMessage
+from rs_relpose_ros.bags.sensor_topics import Topic
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.output_files import beside, refuse_existing
 

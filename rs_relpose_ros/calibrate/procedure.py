@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes seconds to import, at the start of a node
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
 from rs_relpose_ros.calibration import errors, fit, model, observations, repeated
 from rs_relpose_ros.calibration.findings import Code

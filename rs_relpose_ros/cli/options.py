@@ -16,7 +16,8 @@ import numpy as np
 import scipy
 from tqdm import tqdm
 
-from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics, Topic
+from rs_relpose_ros.bags.reader import Bag, open_bag
+from rs_relpose_ros.bags.sensor_topics import SensorTopics, Topic
 from rs_relpose_ros.cli.main import package_version
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters

@@ -8,7 +8,8 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from rs_relpose_ros.bags.reader import Bag, option_of, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.sensor_topics import option_of, SensorTopics
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
 from rs_relpose_ros.config.files import file_values, read_parameters

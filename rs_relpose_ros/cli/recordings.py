@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 from rs_relpose_ros.bags.convert import android, apple, FORMATS, phone, video
 from rs_relpose_ros.bags.convert.euroc import read_euroc
 from rs_relpose_ros.bags.convert.recording import Recording, write_bag
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.sensor_topics import COMPRESSED_IMAGE
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibrate.procedure import calibrate_together, CalibrationInput, read_recording
 from rs_relpose_ros.cli import options

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.config.settings import Parameters, sensor_model, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array

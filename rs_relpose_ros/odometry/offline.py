@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from scipy.special import gammaincinv
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.calibration import findings_text
 from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.config.settings import Parameters, sensor_model

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rs_relpose_ros.bags import reader
-from rs_relpose_ros.bags.reader import Bag, Chosen, SensorTopics, Topic
+from rs_relpose_ros.bags import sensor_topics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.sensor_topics import Chosen, SensorTopics, Topic
 from rs_relpose_ros.calibration import observations
 from rs_relpose_ros.calibration.assessment import not_evaluated
 from rs_relpose_ros.calibration.findings import (
@@ -292,7 +293,7 @@ def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Line]:
             ': the size changes',
         ),
     )
-    compressed = topic.msgtype == reader.COMPRESSED_IMAGE
+    compressed = topic.msgtype == sensor_topics.COMPRESSED_IMAGE
     if compressed == (parameters.pair.image_transport == 'compressed'):
         return [found]
     right = 'compressed' if compressed else 'raw'

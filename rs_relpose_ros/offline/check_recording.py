@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.calibrate.procedure import read_recording, Recorder
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibration import findings

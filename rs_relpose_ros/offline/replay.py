@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rs_relpose_ros.bags.convert.text_files import check_file, read_rows, Row
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import summary_json, summary_lines

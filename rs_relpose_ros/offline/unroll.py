@@ -4,8 +4,9 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
-from rs_relpose_ros.bags import reader
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
+from rs_relpose_ros.bags import sensor_topics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.sensor_topics import SensorTopics, Topic
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
@@ -91,7 +92,7 @@ class Unrolling:
                 self.copied += 1
                 self._writer.copy(raw)
             if role is None:
-                if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
+                if raw.msgtype in (sensor_topics.IMAGE, sensor_topics.COMPRESSED_IMAGE):
                     stamp = stamp_ns(self._bag.read(raw).header)
                     self._shared.setdefault(raw.topic, []).append(stamp in self._times)
                 continue
@@ -112,7 +113,7 @@ class Unrolling:
         types = self._writer.type
         origin = result.stamp_ns, result.frame_id
         pixels = result.image()
-        if topic.msgtype == reader.COMPRESSED_IMAGE:
+        if topic.msgtype == sensor_topics.COMPRESSED_IMAGE:
             image = outgoing.compressed_image_message(
                 *origin, pixels, png=result.is_png, types=types
             )
@@ -122,7 +123,7 @@ class Unrolling:
         info = outgoing.camera_info_message(*origin, result.intrinsics, published, types)
         info_topic = self._topics.camera_info
         name = topic.camera_info if info_topic is None else info_topic.name
-        self._writer.write(name, reader.CAMERA_INFO, info, bag_time_ns)
+        self._writer.write(name, sensor_topics.CAMERA_INFO, info, bag_time_ns)
         self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)
         self.images += 1
         self.largest_shift = max(self.largest_shift, result.map.shift)

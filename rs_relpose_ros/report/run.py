@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, Chosen, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.sensor_topics import Chosen, SensorTopics
 from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED, worst_of
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import sensor_topics
 from rs_relpose_ros.bags.convert.text_files import check_file
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.files import SourcedValue
@@ -139,15 +139,17 @@ def write_bag(
     """
     with BagWriter(path) as bag:
         _write_images(bag, recording, on_image)
-        imu_topic = reader.GYRO_TOPIC if recording.accel else reader.IMU_TOPIC
+        imu_topic = sensor_topics.GYRO_TOPIC if recording.accel else sensor_topics.IMU_TOPIC
         _write_samples(bag, imu_topic, recording.cropped(recording.imu))
-        _write_samples(bag, reader.ACCEL_TOPIC, recording.cropped(recording.accel))
+        _write_samples(bag, sensor_topics.ACCEL_TOPIC, recording.cropped(recording.accel))
         for pose in recording.truth:
             message = outgoing.pose_stamped_message(
-                pose.stamp_ns, reader.WORLD_FRAME, pose.quat_xyzw, pose.position, bag.type
+                pose.stamp_ns, sensor_topics.WORLD_FRAME, pose.quat_xyzw, pose.position, bag.type
             )
-            bag_time_ns = pose.stamp_ns + to_nanoseconds(reader.IMU_DELAY)
-            bag.write(reader.GROUND_TRUTH_TOPIC, reader.POSE_STAMPED, message, bag_time_ns)
+            bag_time_ns = pose.stamp_ns + to_nanoseconds(sensor_topics.IMU_DELAY)
+            bag.write(
+                sensor_topics.GROUND_TRUTH_TOPIC, sensor_topics.POSE_STAMPED, message, bag_time_ns
+            )
 
 
 def _write_images(bag: BagWriter, recording: Recording, on_image: Callable[[], object]) -> None:
@@ -156,7 +158,7 @@ def _write_images(bag: BagWriter, recording: Recording, on_image: Callable[[], o
     size = None if camera is None else (camera.width, camera.height)
     reference = 'the first image has' if camera is None else 'the calibration is for'
     readout = 0.0 if camera is None else camera.readout_time
-    delay_ns = to_nanoseconds(reader.IMAGE_DELAY + readout)
+    delay_ns = to_nanoseconds(sensor_topics.IMAGE_DELAY + readout)
     for image in recording.images:
         try:
             data = image.encoded()
@@ -172,28 +174,32 @@ def _write_images(bag: BagWriter, recording: Recording, on_image: Callable[[], o
                 f'{image.name} has {found[0]}x{found[1]} pixels, but {reference} '
                 f'{size[0]}x{size[1]}'
             )
-        place = image.stamp_ns, reader.CAMERA_FRAME
+        place = image.stamp_ns, sensor_topics.CAMERA_FRAME
         bag_time_ns = image.stamp_ns + delay_ns
         if camera is not None:
             info = outgoing.camera_info_message(*place, camera, None, bag.type)
-            bag.write(reader.CAMERA_INFO_TOPIC, reader.CAMERA_INFO, info, bag_time_ns)
+            bag.write(
+                sensor_topics.CAMERA_INFO_TOPIC, sensor_topics.CAMERA_INFO, info, bag_time_ns
+            )
         message = outgoing.encoded_image_message(*place, data, bag.type, recording.image_format)
-        bag.write(reader.COMPRESSED_TOPIC, reader.COMPRESSED_IMAGE, message, bag_time_ns)
+        bag.write(
+            sensor_topics.COMPRESSED_TOPIC, sensor_topics.COMPRESSED_IMAGE, message, bag_time_ns
+        )
         on_image()
 
 
 def _write_samples(bag: BagWriter, topic: str, samples: Sequence[ImuSample]) -> None:
     """Write samples of an IMU, or of a separate accelerometer."""
-    delay_ns = to_nanoseconds(reader.IMU_DELAY)
+    delay_ns = to_nanoseconds(sensor_topics.IMU_DELAY)
     for sample in samples:
         message = outgoing.imu_message(
             sample.stamp_ns,
-            reader.IMU_FRAME,
+            sensor_topics.IMU_FRAME,
             sample.angular_velocity,
             sample.linear_acceleration,
             bag.type,
         )
-        bag.write(topic, reader.IMU, message, sample.stamp_ns + delay_ns)
+        bag.write(topic, sensor_topics.IMU, message, sample.stamp_ns + delay_ns)
 
 
 # -- Readout times as files of cameras and phones have them ---------------------------------------
