@@ -19,11 +19,12 @@ from rs_relpose_ros.calibrate.procedure import (
     calibrate_together,
     CalibrationInput,
     evaluated,
+    within_priors,
 )
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.calibration import fit as fitting
-from rs_relpose_ros.calibration import model, observations
-from rs_relpose_ros.calibration.errors import Doubts, doubts, fit, jackknife, stretches, widened
+from rs_relpose_ros.calibration import knowledge, model, observations
+from rs_relpose_ros.calibration.errors import fit, jackknife, stretches, widened
 from rs_relpose_ros.calibration.fit import (
     evaluate,
     Fit,
@@ -242,7 +243,7 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
     for estimate, true in zip(result.lens.radial, lens.radial_coefficients, strict=True):
         assert abs(estimate.value - true) < 3.0 * estimate.sigma
     # What it does to the image is known better than by the prior.
-    corner = observations.displacements([observations.corner_radius(lens)])[0]
+    corner = knowledge.displacements([knowledge.corner_radius(lens)])[0]
     displacement = result.lens.displacement
     assert displacement.sigma < 0.01
     assert abs(displacement.value - corner @ lens.radial_coefficients) < 3.0 * displacement.sigma
@@ -255,8 +256,8 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
 def test_prior_of_a_lens_is_on_what_it_does_to_the_image(given):
     """2 % of the radius at the corner and 1 % at half of it; a guess may have a k1 of 0.3."""
     camera = camera_of(recorded().truth)
-    covariance = observations.distortion_prior(camera, given=given)
-    radius = observations.corner_radius(camera)
+    covariance = knowledge.distortion_prior(camera, given=given)
+    radius = knowledge.corner_radius(camera)
     assert radius == pytest.approx(
         np.linalg.norm([0.5 * camera.width, 0.5 * camera.height]) / camera.fx
     )
@@ -697,19 +698,49 @@ def test_halves_that_disagree_widen_the_sigmas():
     assert np.sqrt(covariance[BIAS, BIAS]) > 5e-3
 
 
-def test_errors_of_lens_and_gyro_are_added():
-    sigmas = doubts(recorded().truth.width, lens_known=True)
-    final, _ = undisturbed()
-    plain, added = (widened(final, some) for some in (None, sigmas))
-    difference = added.covariance - plain.covariance
+def test_what_the_data_determine_of_a_claim_is_no_doubt():
+    """The doubt of lens and gyro widens the other sigmas by what the data leave of it."""
+    held, _ = undisturbed()
+    claimed = free_of(EXPOSURE) | knowledge.CLAIMED
+    final, _ = fitted(claimed)
+    sigmas, prior = np.sqrt(np.diag(final.covariance)), final.problem.prior
+    for name in (model.FOCAL, model.SCALE.start, model.CENTER.start):
+        assert sigmas[name] < 0.9 * prior[name, name] ** -0.5
+    axes = np.arange(GLOBAL)[model.ROTATION]
+    # Claims and axes trade: skew and principal point, before anything else.
+    assert (sigmas[axes] > 1.2 * np.sqrt(np.diag(held.covariance))[axes]).all()
+    # The errors of the priors are a part of the covariance, whatever scatters.
+    wide = widened(final)
+    left = wide.covariance - wide.by_doubt @ wide.by_doubt.T
+    assert np.linalg.eigvalsh(left[final.block]).min() > -1e-12
+    more = widened(final, knowledge.TANGENTIAL_SIGMA)
+    difference = more.covariance - wide.covariance
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
-    # A gyro whose rates are 0.5 % larger has a bias that is 0.5 % larger, at least.
-    bias = np.abs(recorded().truth.gyro_bias)
-    assert (
-        np.sqrt(np.diag(difference)[model.BIAS]) > 0.3 * sigmas.parameters[model.SCALE] * bias
-    ).all()
-    none = widened(final, Doubts(np.zeros(GLOBAL), 0.0))
-    np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-9)
+    assert difference[model.ROTATION, model.ROTATION].trace() > 0.0
+
+
+def test_widened_sigmas_stay_within_the_priors():
+    """A recording that contradicts itself says less of a claim than the claim, but not nothing."""
+    final, data = fitted(free_of(EXPOSURE) | knowledge.CLAIMED)
+    parameters = final.unknowns.parameters.copy()
+    parameters[model.FOCAL] += 0.02
+    wild = dataclasses.replace(
+        final,
+        unknowns=final.unknowns._replace(parameters=parameters),
+        covariance=1e6 * final.covariance,
+    )
+    result = evaluated(data, wild, np.zeros((2, 2)), TRACKED_IN_IMAGES)
+    assert result.lens is None
+    unknowns, covariance = within_priors(wild, wild.covariance)
+    k = model.FOCAL
+    prior = wild.problem.prior[k, k] ** -0.5
+    assert math.sqrt(covariance[k, k]) == pytest.approx(prior, rel=0.01)
+    # Nothing is left of the value but the claim.
+    assert abs(unknowns.parameters[k]) < 0.1 * prior
+    known = 0.25 * final.covariance
+    same, unchanged = within_priors(final, known)
+    np.testing.assert_allclose(unchanged, known, rtol=1e-6, atol=1e-18)
+    np.testing.assert_allclose(same.parameters, final.unknowns.parameters, atol=1e-9)
 
 
 def test_effect_of_an_exposure_on_a_quadratic_rate():

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.bags.reader import Bag
 from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
-from rs_relpose_ros.calibration import errors, fit, model, observations, repeated
+from rs_relpose_ros.calibration import errors, fit, knowledge, model, observations, repeated
 from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.calibration.findings_text import with_sigma
+from rs_relpose_ros.calibration.knowledge import LensKnowledge
 from rs_relpose_ros.calibration.observations import (
     GyroSeries,
     Observations,
@@ -64,8 +65,6 @@ _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
 _LENS_STAYS = (0.01, 0.01, 0.02, 0.05, 0.05, 5.0, 5.0)
 # Largest number of fits, each about its own lens. [chosen: two or three are usual]
 _LENS_ROUNDS = 6
-# Parameters of an unknown lens that are estimated.
-_LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
 # Sigma of an angle that is not known [rad].
 _ANY_ANGLE = math.pi / math.sqrt(3.0)
 # Focal lengths that are tried, over the guess. [chosen: steps of 19 %, from which the fit
@@ -142,7 +141,9 @@ def fitted(
         )
 
     def about(lens: Array) -> Observations:
-        return Observations.of(tracks, gyro, recording.camera, config, lens, recording.lens_given)
+        return Observations.of(
+            tracks, gyro, recording.camera, config, lens, recording.lens_knowledge
+        )
 
     data = about(np.zeros(N_LENS))
     _check_recording(data, config)
@@ -172,20 +173,18 @@ def _calibrated(
     free = OFFLINE.mask('axes', 'time_offset', 'readout_time', 'gyro_bias')
     free[model.FOCAL] = not focal_known
     data, coarse = _coarse_fit(about, data, free, R_prior, config, rng)
-    free[_LENS] = not focal_known
+    free[knowledge.LENS] = not focal_known
     if not focal_known:
         data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, rng)
         coarse = settled.unknowns
     progress(0.4)
     free[model.SLOPE] = data.stamps.covariates.any()
     free[model.EXPOSURE] = data.exposure.square_sigma > 0.0
+    if config.exposed:
+        free |= knowledge.CLAIMED
     data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
     progress(0.7)
-    doubts = None
-    if config.exposed:
-        longer_side = max(data.camera.width, data.camera.height)
-        doubts = errors.doubts(longer_side, lens_known=focal_known)
-    final = errors.widened(final, doubts)
+    final = errors.widened(final, knowledge.TANGENTIAL_SIGMA if config.exposed else 0.0)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
     curve = fit.cost_curve(
@@ -224,7 +223,7 @@ def warm_up_fit() -> None:
     begin = fit.initial(problem, np.eye(3), 0.0)
     some = OFFLINE.mask('axes', 'readout_time')
     found = errors.fit(fit.with_bends(problem, begin), begin, some, rounds=1)
-    errors.widened(found, errors.doubts(camera.width, lens_known=True))
+    errors.widened(found, knowledge.TANGENTIAL_SIGMA)
 
 
 def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tuple[fit.Fit, bool]:
@@ -447,6 +446,9 @@ _MOST = by_name(
     gyro_bias=0.01,
     focal_log=0.03,
 )
+# Least share of a prior's variance that another variance is divided by, where it is known exactly.
+# [chosen: below any share that matters]
+_LEAST_SHARE = 1e-12
 # Error that is common to a recording and not part of its scatter: of the focal length (relative),
 # as the residual is not linear in the noise of the points. [measured: simulated tracks]
 _COMMON = by_name(focal_log=2e-4)
@@ -489,7 +491,9 @@ def evaluated(
     jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
     notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying))
-    lens = _lens(data, parameters, covariance, wide, one_axis) if final.free[model.FOCAL] else None
+    lens = None
+    if data.knowledge is not LensKnowledge.CLAIMED:
+        lens = _lens(data, parameters, covariance, wide, one_axis)
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         readout_axis=data.camera.readout_axis,
@@ -528,15 +532,29 @@ def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[mode
     sigmas = _COMMON_IN_IMAGES if config.exposed else _COMMON
     common = np.where(final.free, sigmas, 0.0)
     covariance = final.covariance + np.diag(common**2)
-    if not final.free[model.FOCAL]:
-        return final.unknowns, covariance
-    # Widened, the sigmas of the lens may exceed the sigmas of its priors.
+    return within_priors(final, covariance)
+
+
+def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Array]:
+    """The calibration without sigmas of claimed parameters that are larger than their priors'.
+
+    Widened, sigmas may exceed those of the priors. The information that is then missing is added
+    in these directions alone: the prior does not count twice.
+    """
     prior = final.problem.prior
-    known = np.flatnonzero(_LENS & (np.diag(prior) > 0.0))
-    information = prior[np.ix_(known, known)]
-    of_prior = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    center = final.problem.center[known]
-    return joined(final.unknowns, covariance, known, center, of_prior)
+    known = np.flatnonzero(knowledge.CLAIMED & final.free & (np.diag(prior) > 0.0))
+    if not len(known):
+        return final.unknowns, covariance
+    root = np.linalg.cholesky(np.linalg.inv(prior[np.ix_(known, known)]))
+    to_units = np.linalg.inv(root)
+    variances, axes = np.linalg.eigh(to_units @ covariance[np.ix_(known, known)] @ to_units.T)
+    missing = np.maximum(1.0 - 1.0 / np.maximum(variances, _LEAST_SHARE), 0.0)
+    directions = to_units.T @ axes
+    information = (directions * missing) @ directions.T
+    own = covariance[:, known]
+    gain = own @ information @ np.linalg.inv(np.eye(len(known)) + own[known] @ information)
+    off = final.problem.center[known] - final.unknowns.parameters[known]
+    return fit.stepped(final.unknowns, gain @ off), covariance - gain @ own.T
 
 
 def _offset_of_row_0(
@@ -587,7 +605,7 @@ def _displacement(
     camera: RollingShutterCamera, coefficients: list[float], covariance: Array
 ) -> Estimate:
     """Displacement of the corner of the image by k1, k2, k3, over its radius."""
-    by_coefficients = observations.displacements([observations.corner_radius(camera)])[0]
+    by_coefficients = knowledge.displacements([knowledge.corner_radius(camera)])[0]
     sigma = math.sqrt(by_coefficients @ covariance @ by_coefficients)
     return Estimate(float(by_coefficients @ coefficients), sigma, True)
 
@@ -599,8 +617,8 @@ _COMPARED_RADII = np.linspace(0.5, 1.0, 6)
 
 def _equivalent_sigma(camera: RollingShutterCamera, covariance: Array) -> float:
     """Sigma of k1 that alone displaces as much as the covariance (3, 3) of k1, k2, k3."""
-    radii = observations.corner_radius(camera) * _COMPARED_RADII
-    by_coefficients = observations.displacements(radii)
+    radii = knowledge.corner_radius(camera) * _COMPARED_RADII
+    by_coefficients = knowledge.displacements(radii)
     variances = np.einsum('ni,ij,nj->n', by_coefficients, covariance, by_coefficients)
     return float(np.max(np.sqrt(variances) / by_coefficients[:, 0]))
 
@@ -727,6 +745,13 @@ class CalibrationInput:
     unused: dict[str, int]  # messages that were not used, by reason
     is_whole: bool = True  # whether the images show the whole sensor, without binning
     lens_given: bool = False  # whether the distortion is that of a CameraInfo, yet estimated
+
+    @property
+    def lens_knowledge(self) -> LensKnowledge:
+        """Where its lens comes from."""
+        if self.focal_known:
+            return LensKnowledge.CLAIMED
+        return LensKnowledge.GIVEN if self.lens_given else LensKnowledge.GUESSED
 
     def calibrated(
         self,

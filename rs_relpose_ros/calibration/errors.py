@@ -3,18 +3,17 @@
 Steps 2 to 4 of docs/calibration.md, "Method": noise of matches by a jackknife over stretches of
 time; errors that regions of the image share (two-way clustering: A. C. Cameron, J. B. Gelbach,
 D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the recording do not share
-(R. T. Birge, Phys. Rev. 40, 1932); doubts of parameters that are not estimated.
+(R. T. Birge, Phys. Rev. 40, 1932); errors of the priors, and of p1 and p2.
 """
 
 from dataclasses import replace
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes seconds to import, at the start of a node
 
-from rs_relpose_ros.calibration import model
 from rs_relpose_ros.calibration.fit import (
     evaluate,
     evaluation,
@@ -136,36 +135,45 @@ _GROSS = 9.0
 _HALF_ROUNDS = 15
 
 
-class Doubts(NamedTuple):
-    """Sigmas of what a fit holds; zero where there is no doubt."""
+def widened(final: Fit, tangential: float = 0.0) -> Fit:
+    """The fit with a covariance of all errors, not only the noise of the matches.
 
-    parameters: Array  # (GLOBAL,)
-    tangential: float  # of p1 and p2
-
-
-def widened(final: Fit, doubts: Doubts | None = None) -> Fit:
-    """The fit with a covariance of all errors, not only the noise of the matches."""
-    wider = np.sqrt(_between_regions(final) * _disagreement(final))
-    scatter = final.covariance * np.outer(wider, wider)
-    if doubts is not None:
-        by_parameters = _by_parameters(final, doubts.parameters)
-        by_tangential = _by_tangential(final, doubts.tangential)
-        by_doubt = np.zeros((GLOBAL, by_parameters.shape[1] + by_tangential.shape[1]))
-        by_doubt[final.free] = np.hstack([by_parameters, by_tangential])
-        scatter += by_doubt @ by_doubt.T
-        final = replace(final, by_doubt=by_doubt)
-    return replace(final, covariance=scatter)
+    The errors of the priors, which recordings of one camera share, are no scatter: regions and
+    halves do not widen them. `tangential` is 1 sigma of p1 and p2, which no fit estimates.
+    """
+    by_prior = _by_prior(final)
+    of_noise = final.covariance - by_prior @ by_prior.T
+    wider = np.sqrt(_between_regions(final, of_noise) * _disagreement(final, of_noise))
+    by_tangential = np.zeros((GLOBAL, 2))
+    if tangential:
+        by_tangential[final.free] = _by_tangential(final, tangential)
+    by_doubt = np.hstack([by_prior, by_tangential])
+    covariance = of_noise * np.outer(wider, wider) + by_doubt @ by_doubt.T
+    return replace(final, covariance=covariance, by_doubt=by_doubt)
 
 
-def _by_parameters(final: Fit, doubts: Array) -> Array:
-    """Moves (k, m) of the free parameters by one sigma of each of m doubted ones."""
-    doubted = (doubts > 0.0) & ~final.free
-    both = final.free | doubted
-    at = evaluate(final.problem, final.unknowns, both)
-    H, _ = normal_equations(final.problem, at, final.unknowns, both)
-    is_free = final.free[both]
-    moves = np.linalg.solve(H[np.ix_(is_free, is_free)], H[np.ix_(is_free, ~is_free)])
-    return np.asarray(moves * doubts[doubted])
+def _by_prior(final: Fit) -> Array:
+    """Moves (GLOBAL, GLOBAL) of the optimum by one sigma of each independent part of the prior."""
+    prior = final.problem.prior[final.block]
+    scale = np.sqrt(np.diag(prior))
+    known = scale > 0.0
+    units = np.where(known, scale, 1.0)
+    shape = prior / np.outer(units, units) + np.diag(np.where(known, 0.0, 1.0))
+    root = scale[:, None] * np.linalg.cholesky(shape)
+    moves = np.zeros((GLOBAL, GLOBAL))
+    moves[final.block] = inverse(_curvature(final) + prior) @ root
+    return moves
+
+
+def _curvature(final: Fit) -> Array:
+    """Hessian (k, k) of the free parameters by the matches, with the curvature of the loss."""
+    return np.asarray(bent(final.weights) * final.information)
+
+
+def _of_noise(final: Fit) -> Array:
+    """Variances (GLOBAL,) without the errors of the priors."""
+    by_prior = _by_prior(final)
+    return np.asarray(np.diag(final.covariance) - (by_prior**2).sum(axis=1))
 
 
 # Share of a doubt for which derivatives are differences. [chosen: residuals change by less than
@@ -190,11 +198,12 @@ def _by_tangential(final: Fit, sigma: float) -> Array:
     return np.asarray(np.linalg.solve(H, np.transpose(gradients)))
 
 
-def _between_regions(final: Fit) -> Array:
+def _between_regions(final: Fit, of_noise: Array) -> Array:
     """Factors (GLOBAL,) of the variances by the scatter of regions beyond that of cells.
 
-    Cells are regions of the image times stretches of time: if the regions scatter no more than
-    these, the scatter of the stretches is complete.
+    `of_noise` (GLOBAL, GLOBAL) is the covariance without the errors of the priors. Cells are
+    regions of the image times stretches of time: if the regions scatter no more than these, the
+    scatter of the stretches is complete.
     """
     problem, unknowns, free = final.problem, final.unknowns, final.free
     region, stretch = _regions(problem.points[0]), stretches(problem.middles)
@@ -219,7 +228,7 @@ def _between_regions(final: Fit) -> Array:
     covariance = inverse(H)
     beyond = np.diag(covariance @ (of_regions - of_cells) @ covariance)
     factors = np.ones(GLOBAL)
-    factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
+    factors[free] += np.maximum(beyond, 0.0) / np.diag(of_noise)[free]
     return factors
 
 
@@ -233,8 +242,12 @@ def _regions(points: Array) -> NDArray[np.int64]:
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
 
 
-def _disagreement(final: Fit) -> Array:
-    """Factors (GLOBAL,) of the variances by the difference of both halves; 1 if it is chance."""
+def _disagreement(final: Fit, of_noise: Array) -> Array:
+    """Factors (GLOBAL,) of the variances by the difference of both halves; 1 if it is chance.
+
+    `of_noise` (GLOBAL, GLOBAL) is the covariance without the errors of the priors, which both
+    halves share.
+    """
     middles, free = final.problem.middles, final.free
     first = middles < np.median(middles)
     one, other = (
@@ -250,49 +263,14 @@ def _disagreement(final: Fit) -> Array:
     turn = one.unknowns.R_cam_imu @ other.unknowns.R_cam_imu.T
     difference[ROTATION] = log_so3(np.ascontiguousarray(turn))
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
-    expected = np.diag(one.covariance + other.covariance)
-    variances = np.maximum(expected, 2.0 * np.diag(final.covariance))
+    expected = _of_noise(one) + _of_noise(other)
+    variances = np.maximum(expected, 2.0 * np.diag(of_noise))
     squares = difference[free] ** 2 / variances[free]
     mean = float(np.minimum(squares, _GROSS).mean())
     of_all = mean if mean > _CHANCE else 1.0
     factors = np.ones(GLOBAL)
     factors[free] = np.maximum(of_all, np.where(squares > _GROSS, squares, 1.0))
     return factors
-
-
-# -- Doubts of parameters that are not estimated --------------------------------------------------
-
-# 1 sigma each. [chosen: what a calibration of a lens by a target, and data sheets of MEMS gyros
-# after the compensation of the manufacturer, leave]
-_FOCAL_DOUBT = 0.005
-# Ratio of the two focal lengths: pixels are square.
-_ASPECT_DOUBT = 0.002
-# Principal point, as a share of the width of the image.
-_CENTER_DOUBT = 0.005
-# First coefficient of a given distortion.
-_RADIAL_DOUBT = 0.02
-# Tangential coefficients p1 and p2 of the distortion.
-_TANGENTIAL_DOUBT = 5e-4
-# Scale of each axis of the gyro.
-_SCALE_DOUBT = 0.005
-# Skew between each two axes of the gyro [rad].
-_SKEW_DOUBT = 0.005
-
-
-def doubts(width: int, *, lens_known: bool) -> Doubts:
-    """Sigmas of what a fit does not estimate of lens and gyro.
-
-    `width` is that of the image [px].
-    """
-    sigmas = np.zeros(GLOBAL)
-    sigmas[model.ASPECT] = _ASPECT_DOUBT
-    sigmas[model.SCALE] = _SCALE_DOUBT
-    sigmas[model.SKEW] = _SKEW_DOUBT
-    if lens_known:
-        sigmas[model.FOCAL] = _FOCAL_DOUBT
-        sigmas[model.CENTER] = _CENTER_DOUBT * width
-        sigmas[model.RADIAL] = _RADIAL_DOUBT
-    return Doubts(sigmas, _TANGENTIAL_DOUBT)
 
 
 # -- Use of a calibration -------------------------------------------------------------------------

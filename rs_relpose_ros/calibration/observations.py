@@ -17,6 +17,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import model
+from rs_relpose_ros.calibration.knowledge import LensKnowledge, prior_information
 from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -168,34 +169,6 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     return FrameTimes(Varying.JITTER, np.array([line[0] for line in lines]) - times)
 
 
-# -- Lens: what is known of it before the fit -----------------------------------------------------
-
-
-def displacements(radii: ArrayLike) -> Array:
-    """Derivatives (N, 3) of the displacement at radii (N,), over the radius, by k1, k2, k3."""
-    squares = np.asarray(radii)[:, None] ** 2
-    return np.asarray(squares ** [1, 2, 3])
-
-
-def corner_radius(camera: RollingShutterCamera) -> float:
-    """Radius of the corner of the image, normalised by the focal length."""
-    return math.hypot(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-
-
-def distortion_prior(camera: RollingShutterCamera, *, given: bool) -> Array:
-    """Covariance (3, 3) of k1, k2, k3 about those of a camera.
-
-    It is on what the lens does to the image, since large coefficients may cancel each other.
-    `given` is whether the camera is that of a CameraInfo, and not a guess.
-    """
-    by_coefficients = displacements(corner_radius(camera) * _PRIOR_RADII)
-    scaled = np.linalg.solve(by_coefficients, np.diag(_PRIOR_DISPLACEMENTS))
-    covariance = scaled @ scaled.T
-    if not given:
-        covariance[0, 0] += _RADIAL_SIGMA**2
-    return np.asarray(covariance)
-
-
 # -- Exposure: the gyro is averaged over it -----------------------------------------------------
 
 # Where automatic exposure lengthens the intervals, the exposure is the interval less this [s].
@@ -277,27 +250,6 @@ MAX_GYRO_GAP = 0.03
 LEAST_ROTATION = math.radians(2.0)
 # Prior of `bend`, 1 sigma, before the parallax is known.
 _BEND_AT_START = 0.1
-# 1 sigma of a gyro's bias [rad/s]. A smaller one would hold a bias of a cheap gyro at zero.
-# [chosen: 1.7 deg/s, the limit of data sheets of MEMS gyros]
-_BIAS_SIGMA = 0.03
-# 1 sigma of the offset's change by a covariate [s/s], which is between -1 and 1.
-# [derived: a stamp at one or the other end of the exposure]
-_SLOPE_SIGMA = 1.0
-# 1 sigma of the principal point of an unknown lens, as a share of the width. A smaller one would
-# hold it in the middle, a larger one lets axes and principal point trade.
-# [chosen: cameras of phones and drones are within 3 %]
-_CENTER_SIGMA = 0.015
-# 1 sigma of the first coefficient of the distortion of a lens of which nothing is known.
-# [chosen: wide lenses have -0.3]
-_RADIAL_SIGMA = 0.3
-# Shares of the radius of the image's corner at which the displacement by a lens has a prior. Three
-# make the prior of three coefficients complete. [derived: half of the radius, the edge, between]
-_PRIOR_RADII = np.array([0.5, 0.75, 1.0])
-# 1 sigma of the displacement there, over the radius, of a lens that is given as without distortion
-# or with one. A smaller one would hold k1 and k2 of two cameras that cancel at the edge, a larger
-# one leaves their sum undetermined. [measured: 1.5 % and 1.3 % at half of the radius, 1.7 % and
-# 1.3 % at the edge, of two cameras that are given as without distortion]
-_PRIOR_DISPLACEMENTS = np.array([0.01, 0.015, 0.02])
 # Error of the rotation between two frames of a gyro without noise, by its sampling [rad].
 _LEAST_ROTATION = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.
@@ -311,7 +263,7 @@ class Observations:
     tracks: TrackedPoints  # of points that the camera model can map to rays
     camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
     lens: Array  # (7,) parameters `model.LENS`
-    lens_given: bool  # whether the camera is that of a CameraInfo; see `distortion_prior`
+    knowledge: LensKnowledge  # where the camera comes from
     times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes
     exposure: Exposure  # before the fit
@@ -328,7 +280,7 @@ class Observations:
         camera: RollingShutterCamera,
         config: CalibrationConfig | None = None,
         lens: ArrayLike = (0.0,) * N_LENS,
-        lens_given: bool = True,
+        knowledge: LensKnowledge = LensKnowledge.CLAIMED,
     ) -> Observations:
         """Observations of at least two frames and two samples."""
         lens = np.array(lens)
@@ -348,7 +300,7 @@ class Observations:
             tracks,
             camera,
             lens,
-            lens_given,
+            knowledge,
             times,
             stamps,
             exposure,
@@ -451,23 +403,9 @@ class Observations:
             of_pixels.by_pixel_by_lens.reshape(*pixels.shape, 2, N_LENS),
             np.full(len(pairs), _BEND_AT_START),
             turn_sigma,
-            self._prior(),
+            prior_information(self.camera, self.knowledge, self.exposure.square_sigma),
             center,
         )
-
-    def _prior(self) -> Array:
-        """Information (GLOBAL, GLOBAL) of the parameters before the fit."""
-        information = np.zeros(model.GLOBAL)
-        information[model.BIAS] = _BIAS_SIGMA**-2
-        information[model.SLOPE] = _SLOPE_SIGMA**-2
-        longer_side = max(self.camera.width, self.camera.height)
-        information[model.CENTER] = (_CENTER_SIGMA * longer_side) ** -2
-        if self.exposure.square_sigma:
-            information[model.EXPOSURE] = self.exposure.square_sigma**-2
-        whole = np.diag(information)
-        of_lens = distortion_prior(self.camera, given=self.lens_given)
-        whole[model.DISTORTION, model.DISTORTION] = np.linalg.inv(of_lens)
-        return whole
 
 
 # -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------

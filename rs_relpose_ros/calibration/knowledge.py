@@ -1,0 +1,121 @@
+"""What is known of a lens and a gyro before a fit: priors of its parameters.
+
+A fit estimates these parameters together with those that a node needs. What the data determine of
+them is no doubt any more; the rest is in the covariance of all parameters.
+"""
+
+from enum import Enum
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_relpose_ros.calibration import model
+from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+
+# Parameters of the lens that are estimated if it is not known.
+LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
+# Parameters that every recording from images may contradict: the claims of a CameraInfo, square
+# pixels, and the axes of a gyro.
+CLAIMED = LENS | OFFLINE.mask('aspect', 'gyro_scale', 'gyro_skew')
+
+
+class LensKnowledge(str, Enum):
+    """Where the camera matrix and the distortion come from."""
+
+    CLAIMED = 'claimed'  # by a CameraInfo, which is used as it is
+    GIVEN = 'given'  # by a CameraInfo, but the lens is to be estimated
+    GUESSED = 'guessed'  # by nobody
+
+
+# 1 sigma of a claimed focal length (relative). A smaller one would take a wrong claim for certain,
+# a larger one would leave weak recordings without a scale of the rotation.
+# [chosen: what a calibration by a target leaves]
+_FOCAL_SIGMA = 0.005
+# 1 sigma of the ratio fy / fx. [chosen: pixels are square; any value in 0.001..0.005 would do]
+_ASPECT_SIGMA = 0.002
+# 1 sigma of a claimed principal point, as a share of the longer side of the image. A smaller one
+# would put the errors of a principal point on the axes. [chosen: as that of the focal length]
+_CLAIMED_CENTER_SIGMA = 0.005
+# 1 sigma of the principal point of an unknown lens, as a share of the longer side. A smaller one
+# would hold it in the middle, a larger one lets axes and principal point trade.
+# [chosen: cameras of phones and drones are within 3 %]
+_CENTER_SIGMA = 0.015
+# 1 sigma of the first coefficient of the distortion of a lens of which nothing is known.
+# [chosen: wide lenses have -0.3]
+_RADIAL_SIGMA = 0.3
+# Shares of the radius of the image's corner at which the displacement by a lens has a prior. Three
+# make the prior of three coefficients complete. [derived: half of the radius, the edge, between]
+_PRIOR_RADII = np.array([0.5, 0.75, 1.0])
+# 1 sigma of the displacement there, over the radius, of a lens that is given as without distortion
+# or with one. A smaller one would hold k1 and k2 of two cameras that cancel at the edge, a larger
+# one leaves their sum undetermined. [measured: 1.5 % and 1.3 % at half of the radius, 1.7 % and
+# 1.3 % at the edge, of two cameras that are given as without distortion]
+_PRIOR_DISPLACEMENTS = np.array([0.01, 0.015, 0.02])
+# 1 sigma of the tangential coefficients p1 and p2, which no fit estimates. A larger one would
+# dominate the doubt of the axes. [chosen: what a calibration by a target leaves]
+TANGENTIAL_SIGMA = 5e-4
+# 1 sigma of the scale of each axis of the gyro. [chosen: data sheets of MEMS gyros after the
+# compensation of the manufacturer]
+_SCALE_SIGMA = 0.005
+# 1 sigma of the skew between each two axes of the gyro [rad]. [chosen: as that of the scale]
+_SKEW_SIGMA = 0.005
+# 1 sigma of a gyro's bias [rad/s]. A smaller one would hold a bias of a cheap gyro at zero.
+# [chosen: 1.7 deg/s, the limit of data sheets of MEMS gyros]
+_BIAS_SIGMA = 0.03
+# 1 sigma of the offset's change by a covariate [s/s], which is between -1 and 1.
+# [derived: a stamp at one or the other end of the exposure]
+_SLOPE_SIGMA = 1.0
+
+
+def displacements(radii: ArrayLike) -> Array:
+    """Derivatives (N, 3) of the displacement at radii (N,), over the radius, by k1, k2, k3."""
+    squares = np.asarray(radii)[:, None] ** 2
+    return np.asarray(squares ** [1, 2, 3])
+
+
+def corner_radius(camera: RollingShutterCamera) -> float:
+    """Radius of the corner of the image, normalised by the focal length."""
+    return math.hypot(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
+
+
+def distortion_prior(camera: RollingShutterCamera, *, given: bool) -> Array:
+    """Covariance (3, 3) of k1, k2, k3 about those of a camera.
+
+    It is on what the lens does to the image, since large coefficients may cancel each other.
+    `given` is whether the camera is that of a CameraInfo, and not a guess.
+    """
+    by_coefficients = displacements(corner_radius(camera) * _PRIOR_RADII)
+    scaled = np.linalg.solve(by_coefficients, np.diag(_PRIOR_DISPLACEMENTS))
+    covariance = scaled @ scaled.T
+    if not given:
+        covariance[0, 0] += _RADIAL_SIGMA**2
+    return np.asarray(covariance)
+
+
+def prior_information(
+    camera: RollingShutterCamera, lens: LensKnowledge, square_sigma: float
+) -> Array:
+    """Information (GLOBAL, GLOBAL) of the parameters before the fit; zero if nothing is known.
+
+    `square_sigma` is 1 sigma of the square of the exposure [s^2], 0 if that is given.
+    """
+    sigmas = np.full(model.GLOBAL, np.inf)
+    sigmas[model.BIAS] = _BIAS_SIGMA
+    sigmas[model.SLOPE] = _SLOPE_SIGMA
+    sigmas[model.SCALE] = _SCALE_SIGMA
+    sigmas[model.SKEW] = _SKEW_SIGMA
+    sigmas[model.ASPECT] = _ASPECT_SIGMA
+    of_center = _CENTER_SIGMA
+    if lens is LensKnowledge.CLAIMED:
+        sigmas[model.FOCAL] = _FOCAL_SIGMA
+        of_center = _CLAIMED_CENTER_SIGMA
+    sigmas[model.CENTER] = of_center * max(camera.width, camera.height)
+    if square_sigma:
+        sigmas[model.EXPOSURE] = square_sigma
+    whole = np.diag(sigmas**-2)
+    of_lens = distortion_prior(camera, given=lens is not LensKnowledge.GUESSED)
+    whole[model.DISTORTION, model.DISTORTION] = np.linalg.inv(of_lens)
+    return whole
