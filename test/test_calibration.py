@@ -1,10 +1,12 @@
 """Calibration on simulated tracks: values, observability, refusals, stamps, sigmas."""
 
+import contextlib
 import csv
 import dataclasses
 from functools import lru_cache
 import math
 from pathlib import Path
+import re
 
 import numpy as np
 import pytest
@@ -702,6 +704,41 @@ def test_halves_that_disagree_widen_the_sigmas():
     covariance = widened(final, None).covariance
     # The bias is 0.015 rad/s from the mean in each half.
     assert np.sqrt(covariance[BIAS, BIAS]) > 5e-3
+
+
+def test_a_wrong_claim_of_the_camera_info_is_named_and_not_put_on_the_axes():
+    """An image that was cropped by 30 columns; its CameraInfo was not adapted."""
+    source = recorded()
+    camera = camera_of(source.truth)
+    cropped = dataclasses.replace(camera, cx=camera.cx + 30.0)
+    right, wrong = (
+        calibrate(source.tracks, source.gyro, one, config=TRACKED_IN_IMAGES)
+        for one in (camera, cropped)
+    )
+    assert not any('CameraInfo' in text for text in right.warnings)
+    (text,) = (text for text in wrong.warnings if 'CameraInfo' in text)
+    column, row = re.search(r'principal point of ([\d.]+), ([\d.]+) px', text).groups()
+    assert float(column) == pytest.approx(camera.cx, abs=4.0)
+    assert float(row) == pytest.approx(camera.cy, abs=4.0)
+    for result in (right, wrong):
+        apart = Rotation.from_matrix(source.truth.R_cam_imu @ result.R_cam_imu.T).as_rotvec()
+        assert (np.abs(apart) < 4.0 * result.rotation_sigma).all()
+
+
+@pytest.mark.parametrize('offset', [0.62, -1.2])
+def test_an_offset_beyond_the_search_range_is_found_over_the_overlap(offset):
+    source = recorded()
+    shifted = dataclasses.replace(
+        source.gyro, stamps_ns=source.gyro.stamps_ns + round(offset * NANOSECONDS)
+    )
+    camera = camera_of(source.truth)
+    result = calibrate(source.tracks, shifted, camera)
+    expected = source.truth.time_offset + offset
+    assert result.time_offset.value == pytest.approx(expected, abs=1e-3)
+    bounded = CalibrationConfig(search_overlap=False)
+    with contextlib.suppress(InputError):
+        other = calibrate(source.tracks, shifted, camera, config=bounded)
+        assert abs(other.time_offset.value) < bounded.max_time_offset + 0.05
 
 
 def test_what_the_data_determine_of_a_claim_is_no_doubt():

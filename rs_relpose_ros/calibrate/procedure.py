@@ -86,12 +86,13 @@ def calibrate(
     """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
 
     See `rs_relpose_ros.calibration.model` and docs/calibration.md. The clock of `gyro` differs
-    from the camera's by at most ``config.max_time_offset``; the readout time of `camera` is not
-    used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
-    `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,
-    radial distortion (k1, k2, k3) and principal point are estimated. Rows of the sensor are rows
-    of the image, or columns where these fit better for certain. `rng` selects matches if there are
-    more than needed; `progress` is called with the finished share of the work. InputError if the
+    from the camera's by at most ``config.max_time_offset``, or by any time that leaves half of the
+    images with a gyro (``config.search_overlap``); the readout time of `camera` is not used.
+    `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless `focal_known`,
+    fx and fy are a guess within a factor of 2, whose ratio holds, and focal length, radial
+    distortion (k1, k2, k3) and principal point are estimated. Rows of the sensor are rows of the
+    image, or columns where these fit better for certain. `rng` selects matches if there are more
+    than needed; `progress` is called with the finished share of the work. InputError if the
     recording cannot be used, with what to record instead.
     """
     recording = CalibrationInput(tracks, gyro, camera, focal_known, {})
@@ -307,13 +308,21 @@ def _coarse_fit(
             'Record with a short exposure in good light, and rotate more slowly'
         )
     begins, ends = data.times[observations.frames_of(pairs)]
+    rates, reach = data.image_rates(pairs), config.max_time_offset + 0.02
+    distant: list[float] = []
+    if config.search_overlap:
+        middles = 0.5 * (begins + ends)
+        distant = observations.distant_offsets(
+            rates, middles, data.gyro_times, data.gyro_rates, reach
+        )
     starts = observations.find_starts(
-        data.image_rates(pairs),
+        rates,
         begins,
         ends,
         data.gyro_times,
         data.gyro_rates,
-        max_offset=config.max_time_offset + 0.02,
+        max_offset=reach,
+        distant=distant,
         R_prior=R_prior,
         focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1),
     )
@@ -490,7 +499,8 @@ def evaluated(
         slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
     jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
-    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying))
+    against = _against_claims(data, parameters, covariance) if final.free[model.FOCAL] else ''
+    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying), against)
     lens = None
     if data.knowledge is not LensKnowledge.CLAIMED:
         lens = _lens(data, parameters, covariance, wide, one_axis)
@@ -555,6 +565,47 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     gain = own @ information @ np.linalg.inv(np.eye(len(known)) + own[known] @ information)
     off = final.problem.center[known] - final.unknowns.parameters[known]
     return fit.stepped(final.unknowns, gain @ off), covariance - gain @ own.T
+
+
+# Places of the parts of a lens, in the order of `geometry.lens`. [derived: its entries]
+_OF_FOCAL, _OF_DISTORTION, _OF_CENTER = slice(0, 1), slice(2, 5), slice(5, 7)
+# Sigmas of a claim and of its estimate together beyond which images contradict the claim. Fewer
+# would contradict a right CameraInfo by chance, more would hide a wrong one.
+# [chosen: as other contradictions of a configuration]
+_CONTRADICTED = 4.0
+
+
+def _against_claims(data: Observations, parameters: Array, covariance: Array) -> str:
+    """Name what the images contradict of the lens of a CameraInfo, with its value; '' if nothing.
+
+    The lens is not in the parameter file, and the axes would be wrong with another one.
+    """
+    if data.knowledge is not LensKnowledge.CLAIMED:
+        return ''
+    camera = data.camera.moved_lens(parameters[model.LENS])
+    of_prior = knowledge.prior_covariance_of_lens(data.camera)
+    off = data.lens + parameters[model.LENS]
+    spread = covariance[model.LENS, model.LENS] + of_prior
+    names = []
+    for part, text in (
+        (_OF_FOCAL, f'a focal length of {camera.fx:.1f} px'),
+        (
+            _OF_DISTORTION,
+            'a distortion k1, k2, k3 of '
+            + ', '.join(f'{one:.3f}' for one in camera.radial_coefficients),
+        ),
+        (_OF_CENTER, f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px'),
+    ):
+        own = off[part]
+        gain = float(own @ np.linalg.solve(spread[part, part], own))
+        if gain > _CONTRADICTED**2 + len(own) - 1:
+            names.append(text)
+    if not names:
+        return ''
+    return (
+        f'the images contradict the CameraInfo, and show {" and ".join(names)}: calibrate with '
+        '--lens, and check for images that were cropped, scaled or rotated'
+    )
 
 
 def _offset_of_row_0(

@@ -71,6 +71,10 @@ def fit(
     of_free = jackknife(
         at.score, bent(found.weights) * at.reduced, stretches(problem.middles), prior
     )
+    # Few stretches may scatter less than independent matches would: the larger one counts.
+    formal = np.diag(inverse(found.information + prior))
+    wider = np.sqrt(np.maximum(formal / np.diag(of_free), 1.0))
+    of_free = of_free * np.outer(wider, wider)
     if not found.converged:
         of_free += _OF_LEFT**2 * np.outer(found.left, found.left)
     covariance = np.zeros((GLOBAL, GLOBAL))

@@ -119,3 +119,9 @@ def prior_information(
     of_lens = distortion_prior(camera, given=lens is not LensKnowledge.GUESSED)
     whole[model.DISTORTION, model.DISTORTION] = np.linalg.inv(of_lens)
     return whole
+
+
+def prior_covariance_of_lens(camera: RollingShutterCamera) -> Array:
+    """Covariance (7, 7) of a claimed lens about its claims, before the fit."""
+    information = prior_information(camera, LensKnowledge.CLAIMED, 0.0)
+    return np.asarray(np.linalg.inv(information[model.LENS, model.LENS]))

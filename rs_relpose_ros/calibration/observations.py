@@ -14,6 +14,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import cumulative_trapezoid
+from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import model
@@ -467,13 +468,15 @@ def find_starts(
     max_offset: float,
     focal_factors: Array,
     R_prior: Array | None = None,
+    distant: Sequence[float] = (),
 ) -> list[Start]:
     """Offsets at which the rotated gyro agrees best with the images; best first.
 
     `rates` (P, 3) of the camera hold between `begins` and `ends` (P,) [s] on its clock. Offsets to
-    +- `max_offset` [s] are searched, with each of the `focal_factors` of the assumed focal length;
-    at most three starts of different offsets are returned. Where the rotation about one axis is
-    not determined, it is that of `R_prior`, or of an axis map.
+    +- `max_offset` [s], and near `distant` ones [s], are searched, with each of the
+    `focal_factors` of the assumed focal length; at most three starts of different offsets are
+    returned. Where the rotation about one axis is not determined, it is that of `R_prior`, or of
+    an axis map.
     """
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
 
@@ -497,7 +500,9 @@ def find_starts(
         return min(starts, key=lambda start: start.misfit)
 
     # The best offsets hardly depend on the focal length.
-    offsets = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
+    near = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
+    around = np.arange(-_NEAR_DISTANT, _NEAR_DISTANT + 0.5 * _STEP, _STEP)
+    offsets = np.concatenate([near, *(offset + around for offset in distant)])
     starts = [
         start for offset in offsets if (start := aligned(float(offset), np.median(focal_factors)))
     ]
@@ -509,6 +514,67 @@ def find_starts(
         filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
         key=lambda start: start.misfit,
     )
+
+
+# Step of the times at which sizes of rates are correlated [s]. A longer one would miss a peak.
+# [chosen: hands turn the other way after 0.1 s or more; 5 to 20 ms would do]
+_GRID = 0.01
+# Range about a distant offset that is searched in steps of `_STEP` [s]. [chosen: two of the grid]
+_NEAR_DISTANT = 0.02
+# Largest number of distant offsets. Each costs as much as a second of the near ones.
+# [chosen: the right one has the highest peak wherever the motion does not repeat]
+_MOST_DISTANT = 3
+# Least correlation of the sizes of the rates at a distant offset. A lower one would try noise.
+# [chosen: below that of images in which half of the rotation is right]
+_LEAST_CORRELATION = 0.5
+# Least share of the images that the gyro covers at an offset. [chosen: fewer can correlate by
+# chance]
+_LEAST_COVERED = 0.5
+
+
+def distant_offsets(
+    rates: Array, middles: Array, gyro_times: Array, gyro_rates: Array, beyond: float
+) -> list[float]:
+    """Offsets [s] further than `beyond`, over the whole overlap, at which rates agree in size.
+
+    `rates` (P, 3) of the camera at times (P,) [s] of its clock. The size of a rate does not depend
+    on the axes. Its correlation is that of the times that the gyro covers (masked normalised
+    cross-correlation: D. Padfield, IEEE Trans. Image Processing 21, 2012).
+    """
+    order = np.argsort(middles)
+    images = _on_grid(middles[order], np.linalg.norm(rates[order], axis=1))
+    # The gyro sees what the images do not: it is averaged over about a frame.
+    width = max(round(float(np.median(np.diff(middles[order]))) / _GRID), 1)
+    sizes = np.linalg.norm(gyro_rates - np.median(gyro_rates, axis=0), axis=1)
+    gyro = np.convolve(_on_grid(gyro_times, sizes), np.full(width, 1.0 / width), mode='same')
+
+    def summed(of_images: Array, of_gyro: Array) -> Array:
+        return np.asarray(fftconvolve(of_gyro, of_images[::-1]))
+
+    ones_images, ones_gyro = np.ones_like(images), np.ones_like(gyro)
+    count = np.maximum(summed(ones_images, ones_gyro), 1.0)
+    image_sum, gyro_sum = summed(images, ones_gyro), summed(ones_images, gyro)
+    of_images = summed(images**2, ones_gyro) - image_sum**2 / count
+    of_gyro = summed(ones_images, gyro**2) - gyro_sum**2 / count
+    product = summed(images, gyro) - image_sum * gyro_sum / count
+    scale = np.sqrt(np.maximum(of_images, 0.0) * np.maximum(of_gyro, 0.0))
+    correlation = product / np.maximum(scale, np.finfo(float).tiny)
+    lags = np.arange(len(correlation)) - (len(images) - 1)
+    offsets = gyro_times[0] - middles[order[0]] + _GRID * lags
+    allowed = (count >= _LEAST_COVERED * len(images)) & (np.abs(offsets) > beyond)
+    correlation = np.where(allowed, correlation, -1.0)
+    chosen: list[float] = []
+    for k in np.argsort(correlation)[::-1]:
+        if correlation[k] < _LEAST_CORRELATION or len(chosen) == _MOST_DISTANT:
+            break
+        if all(abs(offsets[k] - other) > 2.0 * _NEAR_DISTANT for other in chosen):
+            chosen.append(float(offsets[k]))
+    return chosen
+
+
+def _on_grid(times: Array, values: Array) -> Array:
+    """Values at even times."""
+    return np.interp(np.arange(times[0], times[-1], _GRID), times, values)
 
 
 def _mean_rates(turned: Array, times: Array, begin: Array, end: Array) -> Array:

@@ -137,7 +137,8 @@ def _calibration_settings(
         tracking = settings.TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
         config = replace(
             settings.TRACKED_IN_IMAGES,
-            max_time_offset=args.max_offset,
+            max_time_offset=args.max_offset or settings.CalibrationConfig().max_time_offset,
+            search_overlap=args.max_offset is None,
             exposure_time=args.exposure_time,
             exposure_margin=args.exposure_margin,
         )
@@ -213,8 +214,8 @@ CALIBRATE = Command(
             '--max-offset': {
                 'metavar': 'S',
                 'type': float,
-                'default': settings.CalibrationConfig().max_time_offset,
-                'help': 'bound of the clock offset [s] (default: %(default)s)',
+                'help': 'bound of the clock offset [s] (default: none; the whole overlap of '
+                'images and gyro is searched)',
             },
             '--lens': {
                 'metavar': 'MODEL',

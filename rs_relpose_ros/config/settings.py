@@ -510,6 +510,11 @@ class CalibrationConfig(Settings):
         low=1e-5,
         high=1.0,
     )
+    search_overlap: bool = setting(
+        True,
+        'whether an offset beyond max_time_offset is searched, over the whole overlap of images '
+        'and gyro',
+    )
     exposed: bool = setting(
         False, 'whether a tracker followed the points in images with an exposure time'
     )
