@@ -400,7 +400,9 @@ def test_search_finds_offset_and_rotation(rotation, axes):
         [np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i]) for i in range(3)], axis=1
     ) @ R.T + 0.01 * rng.standard_normal((120, 3))
     found, *_ = observations.find_starts(
-        estimated, begins, ends, times, rates, max_offset=0.2, focal_factors=np.ones(1)
+        observations.MeasuredRates(estimated, begins, ends, times, rates),
+        max_offset=0.2,
+        focal_factors=np.ones(1),
     )
     assert found.offset == pytest.approx(0.05, abs=5e-3)
     assert found.misfit < 0.02

@@ -308,19 +308,13 @@ def _coarse_fit(
             'Record with a short exposure in good light, and rotate more slowly'
         )
     begins, ends = data.times[observations.frames_of(pairs)]
-    rates, reach = data.image_rates(pairs), config.max_time_offset + 0.02
-    distant: list[float] = []
-    if config.search_overlap:
-        middles = 0.5 * (begins + ends)
-        distant = observations.distant_offsets(
-            rates, middles, data.gyro_times, data.gyro_rates, reach
-        )
+    measured = observations.MeasuredRates(
+        data.image_rates(pairs), begins, ends, data.gyro_times, data.gyro_rates
+    )
+    reach = config.max_time_offset + 0.02
+    distant = observations.distant_offsets(measured, reach) if config.search_overlap else []
     starts = observations.find_starts(
-        rates,
-        begins,
-        ends,
-        data.gyro_times,
-        data.gyro_rates,
+        measured,
         max_offset=reach,
         distant=distant,
         R_prior=R_prior,
@@ -494,16 +488,15 @@ def evaluated(
     def of(k: int) -> Estimate:
         return _estimate(parameters[k], sigmas[k], wide * _MOST[k])
 
-    slope = None
-    if final.free[model.SLOPE]:
-        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
+    slope = _slope(final, parameters, sigmas)
     jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
-    against = _against_claims(data, parameters, covariance) if final.free[model.FOCAL] else ''
-    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying), against)
-    lens = None
+    lens, against = None, ''
     if data.knowledge is not LensKnowledge.CLAIMED:
         lens = _lens(data, parameters, covariance, wide, one_axis)
+    elif final.free[model.FOCAL]:
+        against = _against_claims(data, parameters, covariance)
+    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying), against)
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         readout_axis=data.camera.readout_axis,
@@ -537,6 +530,13 @@ def evaluated(
     )
 
 
+def _slope(final: fit.Fit, parameters: Array, sigmas: Array) -> Estimate | None:
+    """Change of the offset by a covariate of the frames; None if nothing varies."""
+    if not final.free[model.SLOPE]:
+        return None
+    return _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
+
+
 def _with_common_errors(final: fit.Fit, config: CalibrationConfig) -> tuple[model.Unknowns, Array]:
     """Unknowns and covariance of a fit with the errors that are common to the recording."""
     sigmas = _COMMON_IN_IMAGES if config.exposed else _COMMON
@@ -552,23 +552,27 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     in these directions alone: the prior does not count twice.
     """
     prior = final.problem.prior
-    known = np.flatnonzero(knowledge.CLAIMED & final.free & (np.diag(prior) > 0.0))
+    is_known = knowledge.CLAIMED & final.free & (np.diag(prior) > 0.0)
+    known = np.flatnonzero(is_known)
     if not len(known):
         return final.unknowns, covariance
-    root = np.linalg.cholesky(np.linalg.inv(prior[np.ix_(known, known)]))
+    of_known = np.ix_(known, known)
+    root = np.linalg.cholesky(np.linalg.inv(prior[of_known]))
+    # The covariance in units of the prior, and its axes.
     to_units = np.linalg.inv(root)
-    variances, axes = np.linalg.eigh(to_units @ covariance[np.ix_(known, known)] @ to_units.T)
-    missing = np.maximum(1.0 - 1.0 / np.maximum(variances, _LEAST_SHARE), 0.0)
+    in_units = to_units @ covariance[of_known] @ to_units.T
+    variances, axes = np.linalg.eigh(in_units)
+    of_data = 1.0 / np.maximum(variances, _LEAST_SHARE)
+    missing = np.maximum(1.0 - of_data, 0.0)
     directions = to_units.T @ axes
     information = (directions * missing) @ directions.T
     own = covariance[:, known]
-    gain = own @ information @ np.linalg.inv(np.eye(len(known)) + own[known] @ information)
+    reduced = np.eye(len(known)) + own[known] @ information
+    gain = own @ information @ np.linalg.inv(reduced)
     off = final.problem.center[known] - final.unknowns.parameters[known]
     return fit.stepped(final.unknowns, gain @ off), covariance - gain @ own.T
 
 
-# Places of the parts of a lens, in the order of `geometry.lens`. [derived: its entries]
-_OF_FOCAL, _OF_DISTORTION, _OF_CENTER = slice(0, 1), slice(2, 5), slice(5, 7)
 # Sigmas of a claim and of its estimate together beyond which images contradict the claim. Fewer
 # would contradict a right CameraInfo by chance, more would hide a wrong one.
 # [chosen: as other contradictions of a configuration]
@@ -580,24 +584,23 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
 
     The lens is not in the parameter file, and the axes would be wrong with another one.
     """
-    if data.knowledge is not LensKnowledge.CLAIMED:
-        return ''
     camera = data.camera.moved_lens(parameters[model.LENS])
-    of_prior = knowledge.prior_covariance_of_lens(data.camera)
-    off = data.lens + parameters[model.LENS]
-    spread = covariance[model.LENS, model.LENS] + of_prior
+    radial = ', '.join(f'{one:.3f}' for one in camera.radial_coefficients)
+    values = {
+        'focal_log': f'a focal length of {camera.fx:.1f} px',
+        'distortion': f'a distortion k1, k2, k3 of {radial}',
+        'principal_point': f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px',
+    }
+    off = np.zeros(model.GLOBAL)
+    off[model.LENS] = data.lens + parameters[model.LENS]
+    spread = covariance.copy()
+    spread[model.LENS, model.LENS] += knowledge.prior_covariance_of_lens(data.camera)
     names = []
-    for part, text in (
-        (_OF_FOCAL, f'a focal length of {camera.fx:.1f} px'),
-        (
-            _OF_DISTORTION,
-            'a distortion k1, k2, k3 of '
-            + ', '.join(f'{one:.3f}' for one in camera.radial_coefficients),
-        ),
-        (_OF_CENTER, f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px'),
-    ):
+    for name, text in values.items():
+        part = OFFLINE.part(name)
         own = off[part]
         gain = float(own @ np.linalg.solve(spread[part, part], own))
+        # A vector gains more by chance.
         if gain > _CONTRADICTED**2 + len(own) - 1:
             names.append(text)
     if not names:

@@ -319,10 +319,28 @@ def parameter_file(
     if feature_rows[1] > 0.0:
         values.append(('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
     values += [(name, value, 'By /tf_static.') for name, value in (placed or {}).items()]
+    title = f'{title} {holds_for(result, camera)}'
     missing = [f'{name} ({part.remark})' for part, name, _ in groups if not part.determined]
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
     return parameter_text(title, [SourcedValue(*value) for value in values])
+
+
+def holds_for(result: CalibrationResult, camera: RollingShutterCamera) -> str:
+    """State the conditions of a calibration, beyond which its values may differ."""
+    interval = f'{_MS * result.frame_interval:.1f} ms'
+    if result.offset_by_interval is not None:
+        exposure = f'automatic exposure that changes the frame interval (median {interval})'
+    elif result.exposure_margin:
+        exposure = f'an exposure that follows the frame interval of {interval}'
+    else:
+        exposure = (
+            f'frames of {interval}; another exposure moves time_offset by half of its change'
+        )
+    return (
+        f'It holds for images of {camera.width}x{camera.height}, the same focus and zoom, and '
+        f'{exposure}.'
+    )
 
 
 def _sigma(name: str, value: float, digits: int, source: str = '') -> _Parameter:
@@ -451,6 +469,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         }
     return {
         'observable': result.observable,
+        'holds_for': holds_for(result, camera),
         'shutter': result.shutter,
         'readout_time_s': asdict(result.readout_time),
         'readout_direction': result.readout_direction,

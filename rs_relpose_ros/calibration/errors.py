@@ -68,13 +68,15 @@ def fit(
     """
     found = minimised(problem, unknowns, free, rounds=rounds, tolerance=tolerance)
     at, prior = found.evaluation, problem.prior[found.block]
-    of_free = jackknife(
-        at.score, bent(found.weights) * at.reduced, stretches(problem.middles), prior
-    )
+    curvatures = bent(found.weights) * at.reduced
+    of_free = jackknife(at.score, curvatures, stretches(problem.middles), prior)
     # Few stretches may scatter less than independent matches would: the larger one counts.
-    formal = np.diag(inverse(found.information + prior))
-    wider = np.sqrt(np.maximum(formal / np.diag(of_free), 1.0))
-    of_free = of_free * np.outer(wider, wider)
+    inverse_curvature = inverse(curvatures.sum(axis=0) + prior)
+    of_prior = inverse_curvature @ prior @ inverse_curvature
+    of_noise = of_free - of_prior
+    formal = inverse_curvature @ found.information @ inverse_curvature
+    wider = np.sqrt(np.maximum(np.diag(formal) / np.diag(of_noise), 1.0))
+    of_free = of_noise * np.outer(wider, wider) + of_prior
     if not found.converged:
         of_free += _OF_LEFT**2 * np.outer(found.left, found.left)
     covariance = np.zeros((GLOBAL, GLOBAL))

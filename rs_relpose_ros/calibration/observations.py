@@ -458,12 +458,18 @@ class Start(NamedTuple):
     misfit: float  # share of the variance of the rotation that is not common
 
 
+class MeasuredRates(NamedTuple):
+    """Angular velocities of images and gyro, each on its own clock."""
+
+    rates: Array  # (P, 3) of the camera, by the images [rad/s]
+    begins: Array  # (P,) times between which they hold [s]
+    ends: Array  # (P,)
+    gyro_times: Array  # (K,) [s]
+    gyro_rates: Array  # (K, 3) IMU frame [rad/s]
+
+
 def find_starts(
-    rates: Array,
-    begins: Array,
-    ends: Array,
-    gyro_times: Array,
-    gyro_rates: Array,
+    measured_rates: MeasuredRates,
     *,
     max_offset: float,
     focal_factors: Array,
@@ -472,12 +478,12 @@ def find_starts(
 ) -> list[Start]:
     """Offsets at which the rotated gyro agrees best with the images; best first.
 
-    `rates` (P, 3) of the camera hold between `begins` and `ends` (P,) [s] on its clock. Offsets to
-    +- `max_offset` [s], and near `distant` ones [s], are searched, with each of the
+    Offsets to +- `max_offset` [s], and near `distant` ones [s], are searched, with each of the
     `focal_factors` of the assumed focal length; at most three starts of different offsets are
     returned. Where the rotation about one axis is not determined, it is that of `R_prior`, or of
     an axis map.
     """
+    rates, begins, ends, gyro_times, gyro_rates = measured_rates
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
 
     def aligned(offset: float, factors: ArrayLike) -> Start | None:
@@ -532,44 +538,55 @@ _LEAST_CORRELATION = 0.5
 _LEAST_COVERED = 0.5
 
 
-def distant_offsets(
-    rates: Array, middles: Array, gyro_times: Array, gyro_rates: Array, beyond: float
-) -> list[float]:
+def distant_offsets(measured: MeasuredRates, beyond: float) -> list[float]:
     """Offsets [s] further than `beyond`, over the whole overlap, at which rates agree in size.
 
-    `rates` (P, 3) of the camera at times (P,) [s] of its clock. The size of a rate does not depend
-    on the axes. Its correlation is that of the times that the gyro covers (masked normalised
-    cross-correlation: D. Padfield, IEEE Trans. Image Processing 21, 2012).
+    The size of a rate does not depend on the axes.
     """
+    middles = 0.5 * (measured.begins + measured.ends)
     order = np.argsort(middles)
-    images = _on_grid(middles[order], np.linalg.norm(rates[order], axis=1))
-    # The gyro sees what the images do not: it is averaged over about a frame.
-    width = max(round(float(np.median(np.diff(middles[order]))) / _GRID), 1)
-    sizes = np.linalg.norm(gyro_rates - np.median(gyro_rates, axis=0), axis=1)
-    gyro = np.convolve(_on_grid(gyro_times, sizes), np.full(width, 1.0 / width), mode='same')
-
-    def summed(of_images: Array, of_gyro: Array) -> Array:
-        return np.asarray(fftconvolve(of_gyro, of_images[::-1]))
-
-    ones_images, ones_gyro = np.ones_like(images), np.ones_like(gyro)
-    count = np.maximum(summed(ones_images, ones_gyro), 1.0)
-    image_sum, gyro_sum = summed(images, ones_gyro), summed(ones_images, gyro)
-    of_images = summed(images**2, ones_gyro) - image_sum**2 / count
-    of_gyro = summed(ones_images, gyro**2) - gyro_sum**2 / count
-    product = summed(images, gyro) - image_sum * gyro_sum / count
-    scale = np.sqrt(np.maximum(of_images, 0.0) * np.maximum(of_gyro, 0.0))
-    correlation = product / np.maximum(scale, np.finfo(float).tiny)
+    middles = middles[order]
+    images = _on_grid(middles, np.linalg.norm(measured.rates[order], axis=1))
+    # The rates of the images are means over about a frame, and so is the gyro here.
+    width = max(round(float(np.median(np.diff(middles))) / _GRID), 1)
+    moving = measured.gyro_rates - np.median(measured.gyro_rates, axis=0)
+    sizes = _on_grid(measured.gyro_times, np.linalg.norm(moving, axis=1))
+    gyro = np.convolve(sizes, np.full(width, 1.0 / width), mode='same')
+    correlation, covered = _correlation(images, gyro)
     lags = np.arange(len(correlation)) - (len(images) - 1)
-    offsets = gyro_times[0] - middles[order[0]] + _GRID * lags
-    allowed = (count >= _LEAST_COVERED * len(images)) & (np.abs(offsets) > beyond)
+    offsets = measured.gyro_times[0] - middles[0] + _GRID * lags
+    allowed = (covered >= _LEAST_COVERED) & (np.abs(offsets) > beyond)
     correlation = np.where(allowed, correlation, -1.0)
     chosen: list[float] = []
     for k in np.argsort(correlation)[::-1]:
         if correlation[k] < _LEAST_CORRELATION or len(chosen) == _MOST_DISTANT:
             break
-        if all(abs(offsets[k] - other) > 2.0 * _NEAR_DISTANT for other in chosen):
+        apart = np.abs(np.array(chosen) - offsets[k])
+        if (apart > 2.0 * _NEAR_DISTANT).all():
             chosen.append(float(offsets[k]))
     return chosen
+
+
+def _correlation(images: Array, gyro: Array) -> tuple[Array, Array]:
+    """Correlation of two series at each lag over what they share, and that share of `images`.
+
+    Masked normalised cross-correlation: D. Padfield, IEEE Trans. Image Processing 21, 2012.
+    """
+
+    def summed(of_images: Array, of_gyro: Array) -> Array:
+        return np.asarray(fftconvolve(of_gyro, of_images[::-1]))
+
+    ones_images = np.ones_like(images)
+    ones_gyro = np.ones_like(gyro)
+    count = np.maximum(summed(ones_images, ones_gyro), 1.0)
+    image_sum = summed(images, ones_gyro)
+    gyro_sum = summed(ones_images, gyro)
+    of_images = summed(images**2, ones_gyro) - image_sum**2 / count
+    of_gyro = summed(ones_images, gyro**2) - gyro_sum**2 / count
+    product = summed(images, gyro) - image_sum * gyro_sum / count
+    scale = np.sqrt(np.maximum(of_images, 0.0) * np.maximum(of_gyro, 0.0))
+    correlation = product / np.maximum(scale, np.finfo(float).tiny)
+    return correlation, count / len(images)
 
 
 def _on_grid(times: Array, values: Array) -> Array:
