@@ -191,17 +191,20 @@ def _by_tangential(final: Fit, sigma: float) -> Array:
     """Moves (k, 2) of the free parameters by one sigma of p1 and of p2."""
     problem, unknowns, free = final.problem, final.unknowns, final.free
     H, _ = normal_equations(problem, final.evaluation, unknowns, free)
-    x, y = problem.points[..., 0], problem.points[..., 1]
-    mixed, squares = 2.0 * x * y, x * x + y * y
+    x = problem.points[..., 0]
+    y = problem.points[..., 1]
+    mixed = 2.0 * x * y
+    squares = x * x + y * y
     by_p1 = np.stack([mixed, squares + 2.0 * y * y], axis=-1)
     by_p2 = np.stack([squares + 2.0 * x * x, mixed], axis=-1)
     here = final.evaluation.score.sum(axis=0)
-    gradients = []
-    for displacement in (by_p1, by_p2):
-        moved = problem._replace(points=problem.points - _SMALL * sigma * displacement)
-        there = evaluate(moved, unknowns, free).score.sum(axis=0)
-        gradients.append((there - here) / _SMALL)
-    return np.asarray(np.linalg.solve(H, np.transpose(gradients)))
+    gradients = np.empty((len(here), 2))
+    step = _SMALL * sigma
+    for k, displacement in enumerate((by_p1, by_p2)):
+        moved = problem._replace(points=problem.points - step * displacement)
+        there = evaluate(moved, unknowns, free)
+        gradients[:, k] = (there.score.sum(axis=0) - here) / _SMALL
+    return np.asarray(np.linalg.solve(H, gradients))
 
 
 def _between_regions(final: Fit, of_noise: Array) -> Array:
@@ -290,11 +293,15 @@ def move_of_poses(final: Fit, covariance: Array) -> float:
     """Move of the direction of the median pair by the doubt of the parameters, over its sigma."""
     at = final.evaluation
     lower = at.own.transpose(2, 0, 1)
-    own = np.linalg.inv(lower + np.tril(lower, -1).transpose(0, 2, 1))[:, :2, :2]
+    upper = np.tril(lower, -1).transpose(0, 2, 1)
+    of_noise = np.linalg.inv(lower + upper)
     back = at.back[:-1, :2].transpose(2, 1, 0)
-    moved = back @ covariance[final.block] @ back.transpose(0, 2, 1)
+    of_doubt = back @ covariance[final.block] @ back.transpose(0, 2, 1)
+    noise = min(_median_size(of_noise[:, :2, :2]), _KNOWN_DIRECTION)
+    return _median_size(of_doubt) / noise
 
-    def median_size(of_pairs: NDArray[Any]) -> float:
-        return float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
 
-    return median_size(moved) / min(median_size(own), _KNOWN_DIRECTION)
+def _median_size(of_pairs: NDArray[Any]) -> float:
+    """Sigma of the median pair, from the covariances (P, 2, 2) of the pairs' directions."""
+    variances = np.trace(of_pairs, axis1=1, axis2=2)
+    return float(np.sqrt(np.median(variances)))
