@@ -216,8 +216,26 @@ def multiply(A: Array, B: Array, out: Array) -> None:
             out[i, j] = row[j]
 
 
+@kernel
+def product(A: Array, B: Array) -> Array:
+    """``A B`` (3, 3)."""
+    out = np.empty((3, 3))
+    multiply(A, B, out)
+    return out
+
+
+@kernel
+def product_transposed(A: Array, B: Array) -> Array:
+    """``A B^T`` (3, 3)."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = dot(A[i], B[j])
+    return out
+
+
 @register_jitable
-def skew(v: Array) -> Array:
+def skew(v: Vector | Array) -> Array:
     """Cross-product matrix (3, 3) of a vector (3,): ``skew(a) @ b = a x b``."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 

@@ -14,16 +14,28 @@ from rs_relpose_ros.calibration.findings import Code, Finding, FindingState
 from rs_relpose_ros.core.deviations import slices
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
+    add,
+    column,
+    cross,
+    dot,
     exp_so3,
     log_so3,
     norm,
+    product,
+    product_transposed,
+    rotated,
+    rotated_back,
+    scale,
     skew,
     STANDARD_GRAVITY,
+    subtract,
     tangent_basis,
+    Vector,
+    write_column,
 )
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuInterval
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.messages.published_pair import PublishedPair
 
 # Difference of a velocity from the mean one, in units of it, from which its information does not
@@ -159,13 +171,15 @@ _LEAST_COSINE = 0.1
 COLUMNS = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'arm': 3, 'mount': 4})
 # Number of these columns. [derived: sum of the sizes]
 _WIDTH = 25
+# The column of the delay, which is the last one. [derived: the order]
+_DELAY = _WIDTH - 1
 
 
 @kernel
 def _moved(body: Body, delay: float) -> Body:
     """The body after a delay, at its rate and acceleration."""
     return Body(
-        body.R @ exp_so3(delay * body.rate),
+        product(body.R, exp_so3(delay * body.rate)),
         body.position + delay * body.velocity,
         body.velocity + delay * body.acceleration,
         body.rate,
@@ -173,29 +187,50 @@ def _moved(body: Body, delay: float) -> Body:
     )
 
 
-@kernel
-def _by_earlier(
-    by: Array,
-    own: int,
-    body: Body,
-    later: Body,
-    delay: float,
-) -> None:
-    """Turn derivatives (11, 25) by a body after the delay into those by the body before it.
+@small_kernel
+def _add_column(v: Vector, rows: Array, first: int, i: int) -> None:
+    """Add a vector to column i of `rows` (n, m), from row `first` on."""
+    rows[first, i] += v[0]
+    rows[first + 1, i] += v[1]
+    rows[first + 2, i] += v[2]
 
-    `own`: its first column. The derivative by the delay is added to the last column.
+
+@kernel
+def _by_earlier(by: Array, own: int, body: Body, later: Body, delay: float) -> None:
+    """Turn derivatives (25, 11) by a body after the delay into those by the body before it.
+
+    `own`: its first row. The derivative by the delay is added to the last row.
     """
-    back = exp_so3(-delay * body.rate)
-    rotation = by[:, own : own + 3].copy()
-    place = by[:, own + 3 : own + 6].copy()
-    velocity = by[:, own + 6 : own + 9].copy()
-    to_body = np.ascontiguousarray(later.R.T)
-    by[:, own : own + 3] = rotation @ back
-    by[:, own + 3 : own + 6] = place @ back
-    by[:, own + 6 : own + 9] = velocity + delay * (place @ to_body)
-    moving = to_body @ body.velocity
-    by[:, _WIDTH - 1] += rotation @ body.rate
-    by[:, _WIDTH - 1] += place @ moving + velocity @ body.acceleration
+    turn = exp_so3(delay * body.rate)
+    moving = rotated_back(later.R, body.velocity)
+    for i in range(by.shape[1]):
+        rotation = column(by, own, i)
+        place = column(by, own + 3, i)
+        velocity = column(by, own + 6, i)
+        write_column(rotated(turn, rotation), by, own, i)
+        write_column(rotated(turn, place), by, own + 3, i)
+        by_delay = dot(rotation, body.rate) + dot(place, moving)
+        by[_DELAY, i] += by_delay + dot(velocity, body.acceleration)
+        further = rotated(later.R, place)
+        _add_column(scale(delay, further), by, own + 6, i)
+
+
+@kernel
+def _by_bodies(arm: Array, C: Array, R12C: Array, q: Vector) -> Array:
+    """Derivatives (25, 3) of the baseline q in the axes of camera 1.
+
+    `C` and `R12C` turn from the axes of both bodies to those of camera 1.
+    """
+    by = np.zeros((_WIDTH, 3))
+    for i in range(3):
+        across = skew(q)[i]
+        write_column(add(rotated_back(C, across), cross(C[i], arm)), by, 0, i)
+        write_column(scale(-1.0, C[i]), by, 3, i)
+        write_column(cross(arm, R12C[i]), by, 9, i)
+        write_column(scale(1.0, R12C[i]), by, 12, i)
+        write_column(subtract(R12C[i], C[i]), by, 18, i)
+        write_column(scale(-1.0, across), by, 21, i)
+    return by
 
 
 @kernel
@@ -206,54 +241,57 @@ def deviations(
     measured: Measured,
 ) -> tuple[Array, Array]:
     """Deviations (11,) of a measured pair from two bodies, and their derivatives (11, 25)."""
-    C, c = exp_so3(mount.axes) @ mount.R, mount.arm
-    body1, body2 = first, second
-    if mount.delay != 0.0:
-        body1, body2 = _moved(first, mount.delay), _moved(second, mount.delay)
-    arm = skew(c)
-    back = C @ body1.R.T
-    R12 = back @ body2.R @ C.T
-    R12C = R12 @ C
-    q = back @ (body2.position + body2.R @ c - body1.position - body1.R @ c)
+    body1, body2 = _moved(first, mount.delay), _moved(second, mount.delay)
+    arm, C = mount.arm, product(exp_so3(mount.axes), mount.R)
+    back = product_transposed(C, body1.R)
+    R12C = product(back, body2.R)
+    R12 = product_transposed(R12C, C)
+    place1 = add(body1.position, rotated(body1.R, arm))
+    place2 = add(body2.position, rotated(body2.R, arm))
+    q = rotated(back, subtract(place2, place1))
     b = max(norm(q), _LEAST_BASELINE)
-    u = q / b
-    across = skew(q)
-    dq = np.zeros((3, _WIDTH))
-    dq[:, 0:3] = across @ C + C @ arm
-    dq[:, 3:6] = -C
-    dq[:, 9:12] = -R12C @ arm
-    dq[:, 12:15] = R12C
-    dq[:, 18:21] = R12C - C
-    dq[:, 21:24] = -across
-    db = u @ dq
-    e, by = np.empty(11), np.zeros((11, _WIDTH))
-    e[0:3] = log_so3(R12 @ measured.R.T)
-    by[0:3, 0:3] = -C
-    by[0:3, 9:12] = R12C
-    by[0:3, 21:24] = np.eye(3) - R12
-    B, along = tangent_basis(measured.t), measured.t @ u
+    u = scale(1.0 / b, q)
+    e, by = np.empty(11), np.zeros((_WIDTH, 11))
+    turn = log_so3(product_transposed(R12, measured.R))
+    B, along = tangent_basis(measured.t), dot(measured.t, u)
     # More than 90 deg from the measured direction the tangent is undefined: the sine instead.
     along = along if along > _LEAST_COSINE else 1.0
-    du = (dq - np.outer(u, db)) / b
-    e[3:5] = B.T @ u / along
-    by[3:5] = (B.T @ du - np.outer(e[3:5], measured.t @ du)) / along
+    for i in range(3):
+        e[i] = turn[i]
+        write_column(scale(-1.0, C[i]), by, 0, i)
+        write_column(scale(1.0, R12C[i]), by, 9, i)
+        write_column(scale(-1.0, R12[i]), by, 21, i)
+        by[21 + i, i] += 1.0
     for k in range(2):
+        e[3 + k] = dot(B[:, k], u) / along
         body, to_camera = (body1, C) if k == 0 else (body2, R12C)
         # The lever arm rotates with the body.
-        swing = skew(body.rate) @ c
-        w = back @ (body.velocity + body.R @ swing)
-        turned = skew(w)
-        own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
-        e[rows] = w / b - measured.velocities[3 * k : 3 * k + 3]
-        by[rows, 0:3] += turned @ C
-        by[rows, own : own + 3] -= to_camera @ skew(swing)
-        by[rows, own + 6 : own + 9] = back
-        by[rows, 18:21] = to_camera @ skew(body.rate)
-        by[rows, 21:24] = -turned
-        by[rows] = (by[rows] - np.outer(w / b, db)) / b
-    _by_earlier(by, 0, first, body1, mount.delay)
-    _by_earlier(by, 9, second, body2, mount.delay)
-    return e, by
+        swing = cross(body.rate, arm)
+        w = rotated(back, add(body.velocity, rotated(body.R, swing)))
+        for i in range(3):
+            deviation = 5 + 3 * k + i
+            across = skew(w)[i]
+            e[deviation] = w[i] / b - measured.velocities[3 * k + i]
+            _add_column(rotated_back(C, across), by, 0, deviation)
+            _add_column(cross(swing, to_camera[i]), by, 9 * k, deviation)
+            _add_column(scale(1.0, back[i]), by, 9 * k + 6, deviation)
+            _add_column(cross(to_camera[i], body.rate), by, 18, deviation)
+            _add_column(scale(-1.0, across), by, 21, deviation)
+    # What is divided by the length of the baseline changes with it.
+    by_bodies = _by_bodies(arm, C, R12C, q)
+    for row in range(_WIDTH):
+        dq = by_bodies[row]
+        db = dot(u, dq)
+        du = scale(1.0 / b, subtract(dq, scale(db, u)))
+        for k in range(2):
+            by[row, 3 + k] = (dot(B[:, k], du) - e[3 + k] * dot(measured.t, du)) / along
+        for i in range(6):
+            velocity = e[5 + i] + measured.velocities[i]
+            by[row, 5 + i] = (by[row, 5 + i] - velocity * db) / b
+    for k in range(2):
+        body, later_body = (first, body1) if k == 0 else (second, body2)
+        _by_earlier(by, 9 * k, body, later_body, mount.delay)
+    return e, np.ascontiguousarray(by.T)
 
 
 def square_root(information: Array, gradient: Array) -> tuple[Array, Array]:
