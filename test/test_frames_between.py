@@ -328,8 +328,9 @@ def test_path_by_deviations_equals_finite_differences():
     changes.rays[..., 0] = rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
     changes.times[..., 1] = rng.normal(size=(V, N))
     changes.rotations[1:, :, 2] = rng.normal(size=(V - 1, 3))
-    exact = adjustment.path_by_deviations(tracks, priors, state, sigma, changes)
-    sigmas = 1.0 / np.sqrt(np.diag(adjustment.linearised(tracks, priors, state, sigma).hessian))
+    normal = adjustment.linearised(tracks, priors, state, sigma)
+    exact = adjustment.path_by_deviations(tracks, state, normal, sigma, changes)
+    sigmas = 1.0 / np.sqrt(np.diag(normal.hessian))
     for step in 5e-6 * np.eye(D):
         up, down = (
             from_state(

@@ -341,7 +341,7 @@ class Changes(NamedTuple):
     rotations: Array  # (V, 3, D) of R_v, by a rotation vector on its left [rad]
 
 
-@inlined_kernel
+@small_kernel
 def observe_changes(
     o: Array,
     rows: Array,

@@ -58,9 +58,15 @@ def depths_of_rays(
     A match is not usable, and both of its depths are 1, if it lies behind a camera or if the
     squared sine of the angle between its rays is at most `parallel`.
     """
-    l1, l2, usable = np.ones(len(f)), np.ones(len(f)), np.zeros(len(f), dtype=np.bool_)
-    for i in range(len(f)):
+    count = len(f)
+    l1 = np.ones(count)
+    l2 = np.ones(count)
+    usable = np.zeros(count, dtype=np.bool_)
+    for i in range(count):
         along_f, along_h, squared_sine = scaled_depths(f[i], h[i], baselines[i])
-        if squared_sine > parallel and along_f > 0.0 and along_h > 0.0:
-            l1[i], l2[i], usable[i] = along_f / squared_sine, along_h / squared_sine, True
+        in_front = along_f > 0.0 and along_h > 0.0
+        if in_front and squared_sine > parallel:
+            l1[i] = along_f / squared_sine
+            l2[i] = along_h / squared_sine
+            usable[i] = True
     return l1, l2, usable

@@ -49,7 +49,7 @@ from rs_relpose_ros.geometry.so3 import (
     norm,
     tangent_basis,
 )
-from rs_relpose_ros.jit import kernel, small_kernel
+from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
 # Sigma of the prior of an inverse distance about zero [1/baselines]. It keeps a track without
 # parallax regular; a smaller one would push near points away.
@@ -136,20 +136,25 @@ def _accumulate(
     unknowns `places` (M,) of `rows`, from the residual on, with the unknowns of the track and
     with the residual. `whole` (n + 1, n + 1): of the path, with `gram` (M, M) as room.
     """
-    used = rows.reshape(ROWS, 2 * BLOCK)[RESIDUAL : RESIDUAL + len(places)]
+    count = len(places)
+    used = rows.reshape(ROWS, 2 * BLOCK)[RESIDUAL : RESIDUAL + count]
     np.dot(used, used.T, gram)
-    for y in range(len(places)):
-        for x in range(len(places)):
+    for y in range(count):
+        for x in range(count):
             whole[places[y], places[x]] += gram[y, x]
     for y in range(TRACK_UNKNOWNS):
         for x in range(y + 1):
-            for i in range(BLOCK):
-                own[y, x, i] += rows[y, 0, i] * rows[x, 0, i] + rows[y, 1, i] * rows[x, 1, i]
-    for x in range(len(places)):
+            _add_products(rows[y], rows[x], own[y, x])
+    for x in range(count):
         for y in range(TRACK_UNKNOWNS + 1):
-            row, other, to = rows[RESIDUAL + x], rows[y], mixed[places[x], y]
-            for i in range(BLOCK):
-                to[i] += row[0, i] * other[0, i] + row[1, i] * other[1, i]
+            _add_products(rows[RESIDUAL + x], rows[y], mixed[places[x], y])
+
+
+@inlined_kernel
+def _add_products(rows: Array, others: Array, out: Array) -> None:
+    """Add the products of two unknowns' derivatives (2, BLOCK) over both coordinates."""
+    for i in range(BLOCK):
+        out[i] += rows[0, i] * others[0, i] + rows[1, i] * others[1, i]
 
 
 @small_kernel
@@ -283,14 +288,15 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma:
 
 @kernel
 def path_by_deviations(
-    tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma: float, changes: Changes
+    tracks: TrackBlocks, state: PathState, normal: Normal, sigma: float, changes: Changes
 ) -> Array:
     """Derivative (n, D) of the optimum's path by deviations of what the residuals take as given.
+
+    `normal` are the equations about the optimum `state`, with the noise `sigma` [px].
 
     ``-H^-1 C``, with the Hessian H of the path and its products C with the deviations, the tracks
     eliminated from both.
     """
-    normal = linearised(tracks, priors, state, sigma)
     V, blocks, _ = tracks.used.shape
     n, D = len(normal.gradient), changes.rotations.shape[2]
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
@@ -311,10 +317,7 @@ def path_by_deviations(
                 for y in range(1, used_rows):
                     cross[places[y], d] += (rows[RESIDUAL + y] * columns[d]).sum()
                 for y in range(TRACK_UNKNOWNS):
-                    for i in range(BLOCK):
-                        mixed[d, y, i] += (
-                            rows[y, 0, i] * columns[d, 0, i] + rows[y, 1, i] * columns[d, 1, i]
-                        )
+                    _add_products(rows[y], columns[d], mixed[d, y])
         for d in range(D):
             solve_lower_groups(normal.factors[b], mixed[d], solved)
             for x in range(n):
@@ -336,14 +339,18 @@ def _cost(normal: Normal, tracks: TrackBlocks, sigma: float) -> tuple[float, flo
     return cost, weighted / count
 
 
-@kernel
+@small_kernel
 def moved_state(state: PathState, normal: Normal, step: Array) -> PathState:
     """The state after a step (n,) of the path, each track moved with it."""
-    n, basis, t = len(step), tangent_basis(state.t), np.empty(3)
+    n = len(step)
+    basis = tangent_basis(state.t)
+    t = np.empty(3)
     for x in range(3):
         t[x] = state.t[x] + basis[x, 0] * step[TANGENT] + basis[x, 1] * step[TANGENT + 1]
-    length, bias = norm(t), state.bias.copy()
-    accelerations, rotations = state.accelerations.copy(), state.rotations.copy()
+    length = norm(t)
+    bias = state.bias.copy()
+    accelerations = state.accelerations.copy()
+    rotations = state.rotations.copy()
     for x in range(3):
         t[x] /= length
         bias[x] += step[BIAS + x]
@@ -352,26 +359,28 @@ def moved_state(state: PathState, normal: Normal, step: Array) -> PathState:
         for v in range(1, len(rotations)):
             # Exp is additive to first order: phi is as small as the gyro's error.
             rotations[v, x] += step[n - 3 * (len(rotations) - v) + x]
-    tracks, own = state.tracks.copy(), np.empty((TRACK_UNKNOWNS, BLOCK))
+    tracks = state.tracks.copy()
+    own = np.empty((TRACK_UNKNOWNS, BLOCK))
     for b in range(len(tracks)):
-        track, L, solved = tracks[b], normal.factors[b], normal.tracks[b]
+        track = tracks[b]
+        solved = normal.tracks[b]
         for y in range(TRACK_UNKNOWNS):
             for i in range(BLOCK):
                 own[y, i] = solved[n, y, i]
             for x in range(n):
                 for i in range(BLOCK):
                     own[y, i] += solved[x, y, i] * step[x]
-        solve_upper_groups(L, own)
+        solve_upper_groups(normal.factors[b], own)
         for i in range(BLOCK):
             for x in range(3):
-                track[x, i] -= (
-                    own[0, i] * track[COLUMNS + x, i] + own[1, i] * track[COLUMNS + 3 + x, i]
-                )
+                first = own[0, i] * track[COLUMNS + x, i]
+                second = own[1, i] * track[COLUMNS + 3 + x, i]
+                track[x, i] -= first + second
             track[INVERSE_DISTANCE, i] -= own[2, i]
     return PathState(t, state.log_scale + step[LOG_SCALE], bias, accelerations, rotations, tracks)
 
 
-@kernel
+@small_kernel
 def _step(normal: Normal, damping: float) -> Array:
     """Step (n,) of the path; zero if the equations are singular."""
     step, _ = damped_step(normal.hessian, normal.gradient, damping)
@@ -415,7 +424,7 @@ def adjust(
     )
 
 
-@kernel
+@small_kernel
 def _covariance(
     normal: Normal, state: PathState, priors: PathPriors, common: float, count: int
 ) -> Array:

@@ -17,7 +17,7 @@ from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
 from rs_relpose_ros.estimator.sampson import FitMatches, VIEW_2
 from rs_relpose_ros.geometry import Array, Flags, so3
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 
 # Damping of the first step, as a share of the diagonal of the Hessian. Less lets a first step from
 # a bad start go too far, more costs steps. [chosen: any value in 1e-5..1e-2 would do, because the
@@ -59,7 +59,7 @@ def with_priors(data: NormalEquations, state: TwoViewState, prior: Priors) -> No
     return NormalEquations(hessian, gradient, data.cost + of_priors)
 
 
-@kernel
+@small_kernel
 def fit(
     matches: FitMatches,
     start: TwoViewState,

@@ -37,6 +37,7 @@ from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import by_axes, exp_so3, log_so3, median, skew, tangent_basis
@@ -137,7 +138,9 @@ def _pose_by_deviation(
     """Derivative (6, D) of the pose from all frames by the deviations of `changes`."""
     # The noise of the fit, with the error that residuals do not show.
     noise = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
-    moved = adjustment.path_by_deviations(tracks, priors, adjusted.state, noise, changes)
+    state = adjusted.state
+    normal = adjustment.linearised(tracks, priors, state, noise)
+    moved = adjustment.path_by_deviations(tracks, state, normal, noise, changes)
     by_deviation = _pose_by_path(adjusted, tracks) @ moved
     by_deviation[3:] += changes.rotations[-1]
     return by_deviation
@@ -454,18 +457,14 @@ def _changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
     """
     if problem.gyro is None or problem.R_cam_imu is None:
         return None
-    camera, points = problem.camera, problem.matches.points
-    views, count = points.shape[:2]
+    camera = problem.camera
     basis = selection.basis * selection.scales(camera.width)
-    # The gyro covers the rows of the image only: other observations are put into its middle.
-    rows = camera.rows_of(points)
-    inside = np.isfinite(points).all(axis=2) & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
-    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
-    pixels = np.where(inside[..., None], points, middle)
+    pixels = _within_image(camera, problem.matches.points)
+    views, count = pixels.shape[:2]
     rows = camera.rows_of(pixels)
-    lens = camera.rays_by_lens(pixels.reshape(-1, 2)).by_lens @ basis[LENS]
-    rays = camera.unproject(pixels.reshape(-1, 2)).reshape(views, count, 3)
-    by_lens = lens.reshape(views, count, 3, selection.size)
+    of_lens = camera.rays_by_lens(pixels.reshape(-1, 2))
+    rays = of_lens.values.reshape(views, count, 3)
+    by_lens = of_lens.by_lens.reshape(views, count, 3, -1)
     shares = (rows - camera.reference_row_index) / camera.row_count
     times = camera.row_times(rows)
     of_rays = np.empty((views, count, 3, selection.size))
@@ -474,11 +473,37 @@ def _changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
         path = _path_of_rows(motion)
         states = row_states(path, problem.R_cam_imu, times[view], shares[view])
         turned = np.einsum('nij,nj->ni', states.rotation, rays[view])
-        by_turn = np.cross(states.by_deviation @ basis, turned[:, :, None], axis=1)
-        of_rays[view] = by_turn + states.rotation @ by_lens[view]
+        turns = _by_columns(states.by_deviation, basis)
+        turned_lens = np.einsum('nij,njk->nik', states.rotation, by_lens[view])
+        of_rays[view] = _by_columns(turned_lens, basis[LENS])
+        for axis in range(3):
+            later, last = (axis + 1) % 3, (axis + 2) % 3
+            of_rays[view, :, axis] += turns[:, later] * turned[:, last, None]
+            of_rays[view, :, axis] -= turns[:, last] * turned[:, later, None]
         of_times[view] = states.time_by_deviation @ basis
     between = row_states(problem.gyro, problem.R_cam_imu, problem.seconds, np.zeros(views))
     return Changes(of_rays, of_times, np.ascontiguousarray(between.by_deviation @ basis))
+
+
+def _by_columns(derivatives: Array, basis: Array) -> Array:
+    """Derivatives (N, 3, D) by columns of `basis` (K, D), from those by K deviations (N, 3, K).
+
+    One product of all rows: NumPy would call BLAS once for each of N small matrices.
+    """
+    product = derivatives.reshape(-1, len(basis)) @ basis
+    return np.asarray(product.reshape(len(derivatives), 3, -1))
+
+
+def _within_image(camera: RollingShutterCamera, points: Array) -> Array:
+    """Pixels (V, N, 2); those outside of the rows, which the gyro covers, are put into the middle.
+
+    Observations that do not exist are put there, too.
+    """
+    rows = camera.rows_of(points)
+    known = np.isfinite(points).all(axis=2)
+    inside = known & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
+    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
+    return np.asarray(np.where(inside[..., None], points, middle))
 
 
 def _path_of_rows(motion: FrameMotion) -> GyroPath:

@@ -425,7 +425,7 @@ def _truncated_costs(r: Array, weights: Array, bound: float, noise: float) -> fl
     return cost / (noise * noise)
 
 
-@kernel
+@small_kernel
 def _fit_all(
     matches: FitMatches,
     prior: Priors,

@@ -346,12 +346,13 @@ def _plausible_depths(depths: Array) -> tuple[float, float]:
     The near and the far side have a spread of their own: a scene is denser far away, and its few
     near points, which resemble outliers, determine most of the translation.
     """
-    last = len(depths) - 1
-    near = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[0] * last)))
-    centre = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[1] * last)))
-    far = math.log(so3.smallest(depths, int(DEPTH_QUANTILES[2] * last)))
-    nearer = DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD)
-    farther = DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD)
+    logarithms = np.empty(3)
+    for k in range(3):
+        place = int(DEPTH_QUANTILES[k] * (len(depths) - 1))
+        logarithms[k] = math.log(so3.smallest(depths, place))
+    centre = logarithms[1]
+    nearer = DEPTH_GATE * max(centre - logarithms[0], MIN_DEPTH_SPREAD)
+    farther = DEPTH_GATE * max(logarithms[2] - centre, MIN_DEPTH_SPREAD)
     return math.exp(centre - nearer), math.exp(centre + farther)
 
 

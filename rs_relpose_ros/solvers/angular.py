@@ -63,6 +63,9 @@ def _product_table(left: list[str], products: list[str]) -> Indices:
     )
 
 
+# Most steps that polish a solution, whose error is the rounding of the elimination before them.
+# [chosen: any value in 4..15 would do]
+_POLISHING = 6
 # Products of two linear polynomials, and of a quadratic with a linear one. [derived: the lists]
 _TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
 # The same of a quadratic monomial. [derived: the lists]
@@ -309,7 +312,7 @@ def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
         if (
             _essential_matrix(B, math.tan(0.5 * angles[k]), basis, E)
             and _decompose(E, sample, R, x)
-            and common.polish(sample, factors, axes, R, x[:3], 6)
+            and common.polish(sample, factors, axes, R, x[:3], int(_POLISHING))
             and not common.is_known(R, out.R[:count])
             and common.write_solution(sample, factors, R, x[:3], out.x[count])
         ):

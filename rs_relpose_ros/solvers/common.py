@@ -341,6 +341,9 @@ def polish(
 ) -> bool:
     """Improve `R` (3, 3) and `y` (m,) in place by Newton's method; returns whether it converged.
 
+    `steps` is the largest number of steps. Callers convert their constant by ``int``, since Numba
+    would compile the kernel again for each constant.
+
     R moves about the `axes` (k, 3). The n equations have m + k = n + 1 unknowns, and ``|y| = 1``
     is the last equation. A step that does not reduce the error is shortened.
     """

@@ -31,6 +31,12 @@ _MATRIX_9 = algebra.half_angle_matrix(_DEGREE_9)
 _NODES_3 = algebra.half_angle_nodes(_DEGREE_3)
 # The same for 9 points. [derived: as with 3 points]
 _NODES_9 = algebra.half_angle_nodes(_DEGREE_9)
+# Most steps that polish a yaw. A double root, towards which each step only halves the error, needs
+# this many; fewer would lose it. [chosen: any value in 15..30 would do]
+_YAW_STEPS = 20
+# Most steps that polish a rotation of rank 8: it is nearly exact before them.
+# [chosen: any value in 4..15 would do]
+_RANK_STEPS = 8
 
 
 @kernel
@@ -109,7 +115,7 @@ def _solutions_of_yaws(
             y[:] = 1.0
             algebra.lu_solve(A, pivots, y)  # one step of inverse iteration
             algebra.normalise(y)
-            converged = common.polish(sample, factors, axes, R, y, 20)
+            converged = common.polish(sample, factors, axes, R, y, int(_YAW_STEPS))
             if not converged:  # a conjugate pair: its real angle is the nearest one
                 common.rotation_from_yaw(yaws[k], known, R)
                 common.write_nearest_vector(sample, factors, R, y)
@@ -152,7 +158,7 @@ def _reach_rank_8(sample: Sample, factors: common.RowTimeFactors, R: Array, y: A
             error = squares
             so3.copy_matrix(R_new, R)
             if error < 1e-20 * size2:
-                return common.polish(sample, factors, axes, R, y, 8)
+                return common.polish(sample, factors, axes, R, y, int(_RANK_STEPS))
             hessian = system.T @ system
             gradient = -(system.T @ right)
         cholesky(hessian + damping * damped, factor)
