@@ -214,6 +214,61 @@ def test_a_counter_of_32_bits_is_named(walk, tmp_path, capsys):
     assert 'a 32-bit counter of microseconds overflowed' in run(capsys, 'check', bag, walk[1])[1]
 
 
+# --- two defects at once
+
+
+def wrapped(number: int, entry: Entry) -> Iterator[Entry]:
+    if entry[0] != '/ground_truth/pose' and stamp_of(entry[2]) > made.START_NS + SECOND // 2:
+        stamped(entry[2], stamp_of(entry[2]) - 2**32 * 1000)
+    yield entry
+
+
+def test_bursts_of_a_counter_that_overflows_are_both_named(walk, tmp_path, capsys):
+    bag = changed(walk[0], tmp_path / 'bag', in_bursts)
+    bag = changed(bag, tmp_path / 'wrapped', wrapped)
+    check, report, replay, _ = both(capsys, walk, bag)
+    assert (check, replay) == (0, 0)
+    assert 'bursts of 7' in report and '32-bit counter of microseconds' in report
+
+
+def test_two_publishers_with_repeated_images_are_one_error(walk, tmp_path, capsys):
+    last: dict[str, Any] = {}
+
+    def change(number: int, entry: Entry) -> Iterator[Entry]:
+        topic, msgtype, message, received = entry
+        if topic == IMAGES:
+            data = last.get('data', message.data)
+            last['data'] = message.data if number % 3 else data
+            object.__setattr__(message, 'data', last['data'])
+        yield entry
+        if topic == IMU:
+            other = deepcopy(message)
+            object.__setattr__(other.header, 'frame_id', 'base_imu')
+            yield topic, msgtype, other, received + 1
+
+    check, report, replay, error = both(capsys, walk, changed(walk[0], tmp_path / 'bag', change))
+    assert (check, replay) == (2, 2)
+    for text in (report, error):
+        assert "'imu_link' and 'base_imu'" in text
+
+
+def test_a_conversion_topic_by_topic_without_metadata_gives_the_same_poses(walk, tmp_path, capsys):
+    order = [IMAGES, '/camera/camera_info', IMU, '/ground_truth/pose']
+
+    def change(number: int, entry: Entry) -> Iterator[Entry]:
+        received = made.START_NS + 900 * SECOND * (order.index(entry[0]) + 1) + 1000 * number
+        yield *entry[:3], received
+
+    bag = changed(walk[0], tmp_path / 'bag', change)
+    (bag / 'metadata.yaml').unlink()
+    check, report, replay, _ = both(capsys, walk, bag)
+    assert (check, replay) == (0, 0)
+    assert 'by a conversion' in report and 'delays differ' not in report
+    poses = bag.with_name('out') / 'relative_poses.csv'
+    run(capsys, 'replay', *walk, '--no-pictures', '--out', str(tmp_path / 'ordered'))
+    assert poses.read_bytes() == (tmp_path / 'ordered/relative_poses.csv').read_bytes()
+
+
 def test_intact_streams_have_no_fault(walk, capsys):
     code, report = run(capsys, 'check', *walk)
     assert code == 0 and 'true rate' not in report and 'clock of the' not in report

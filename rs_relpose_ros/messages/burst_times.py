@@ -133,7 +133,7 @@ class _EvenLine:
     @property
     def is_certain(self) -> bool:
         """Whether there are enough bursts to say that they are not even."""
-        return len(self._numbers) >= _UNEVEN_BURSTS
+        return self.is_known and len(self._numbers) >= _UNEVEN_BURSTS
 
     @property
     def doubt(self) -> StampDoubt:

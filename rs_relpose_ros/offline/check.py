@@ -628,6 +628,9 @@ def _accelerometer(scan: Scan) -> Line:
 # Smaller would report slow drivers, larger would miss an offset that loses frames.
 # [chosen: 0.2 to 1 s would do]
 _SAME_CLOCK = 0.5
+# Delay of both sensors [s] above which a conversion has received the messages, not a recorder.
+# [chosen: no link is late by a minute; 30 s to an hour would do]
+_CONVERTED = 60.0
 # Largest legal value of the parameter time_offset [s]. [derived: its declaration]
 _LARGEST_OFFSET = 1e5
 # Matches of a pair in the median below which there is no estimate, and below which they are few.
@@ -749,6 +752,7 @@ def _overlap(
             f'{apart:.1f} s of delivery are more than the {history:g} s of IMU that a node keeps '
             '(imu_buffer_seconds): live, these images have no pose; offline the stamps decide',
         ),
+        Case(has_poses and min(images.delay, imu.delay) > _CONVERTED, OK, '', ', by a conversion'),
         Case(
             abs(apart) > _SAME_CLOCK,
             SUSPECT,
