@@ -78,7 +78,8 @@ _OBSERVABLE_IN = 0.9
 _AS_CONFIGURED = 3.0
 # Error that linearisation leaves, 1 sigma as a share of the last step. Smaller shares would make
 # the sigma of a suggested value too small. [measured: on recordings with times that are far off,
-# steps are 0.4 to 0.8 of the error, with other parameters 0.9; docs/health.md]
+# steps are 0.4 to 0.8 of the error, with other parameters 0.9; without it the first value of an
+# offset of 30 ms is off by 3.1 sigma, with it by 1.2; docs/covariance.md]
 _REMAINS = np.where(LIVE.mask('time_offset', 'readout_time'), 1.0, 0.25)
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
 # selected with the wrong value. [measured: about 0.08 on recordings]
