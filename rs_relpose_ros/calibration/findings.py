@@ -60,6 +60,7 @@ class Code(str, Enum):
     ACCEL_SCALE = 'accel_scale'
     REPEATED_IMAGES = 'repeated_images'
     STATIC_REGION = 'static_region'
+    OFFSET_STEP = 'offset_step'
     # Causes that the odometry names.
     GYRO_NOISE = 'gyro_noise'
     ACCEL_NOISE = 'accel_noise'
@@ -108,6 +109,7 @@ class Why(str, Enum):
     NO_SPECIFIC_FORCE = 'no_specific_force'
     RECTIFIED = 'rectified'
     STILL = 'still'  # images or parts of them, though the camera turns
+    STEPPED = 'stepped'  # a clock was set while the sensors ran
     # Gross errors: `is_gross`.
     GROSS = 'gross'
     LEFT_HANDED = 'left_handed'

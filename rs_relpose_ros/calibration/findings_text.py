@@ -296,6 +296,19 @@ def _static_region(finding: Finding) -> Text:
     )
 
 
+def _offset_step(finding: Finding) -> Text:
+    step = with_sigma(Code.TIME_OFFSET, finding.estimated, finding.sigma or 0.0)
+    measured = finding.evidence.measured
+    before, after = measured['before_ns'] * 1e-9, measured['after_ns'] * 1e-9
+    return Text(
+        f'the time offset between camera and IMU stepped by {step} between the images stamped '
+        f'{before:.3f} and {after:.3f} s: the poses of this time are withheld, later ones have '
+        'the new offset',
+        'find out what sets a clock or its stamps while the sensors run, and let both be stamped '
+        'by one clock that is never set',
+    )
+
+
 def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
@@ -319,6 +332,7 @@ def _knock(finding: Finding) -> Text:
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,
+    (Code.OFFSET_STEP, Why.STEPPED): _offset_step,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
     (Code.KNOCK, Why.OFF): _knock,

@@ -199,7 +199,7 @@ _TRACKED: dict[str, Callable[[Tracked, Applied], str]] = {
     'tracked_gyro_bias_sigma_rad_s': lambda tracked, _: _vector(tracked.gyro_bias_sigma),
     'tracked_time_offset_ms': lambda tracked, _: _ms(tracked.time_offset),
     'tracked_time_offset_sigma_ms': lambda tracked, _: _ms(tracked.time_offset_sigma),
-    'applied_time_offset_ms': lambda _, applied: _ms(applied.time_offset),
+    'applied_time_offset_ms': lambda _, applied: _ms(applied.offset),
     'tracked_readout_time_ms': lambda tracked, _: _ms(tracked.readout_time),
     'tracked_readout_time_sigma_ms': lambda tracked, _: _ms(tracked.readout_time_sigma),
     'applied_readout_time_ms': lambda _, applied: _ms(applied.readout_time),

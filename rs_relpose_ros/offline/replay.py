@@ -336,7 +336,7 @@ def _tracked(last: PairResult | None) -> dict[str, Any] | None:
         'gyro_bias_sigma_rad_s': tracked.gyro_bias_sigma.tolist(),
         'time_offset_s': tracked.time_offset,
         'time_offset_sigma_s': tracked.time_offset_sigma,
-        'applied_s': applied.time_offset,
+        'applied_s': applied.offset,
         'readout_time_s': tracked.readout_time,
         'readout_time_sigma_s': tracked.readout_time_sigma,
         'applied_readout_time_s': applied.readout_time,

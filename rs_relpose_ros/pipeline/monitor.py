@@ -12,7 +12,16 @@ from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
 from rs_relpose_ros.calibration.assessment import Effect, Inconsistency
-from rs_relpose_ros.calibration.findings import Assessment, Configured, Finding
+from rs_relpose_ros.calibration.clock_steps import ClockStep, ClockSteps
+from rs_relpose_ros.calibration.findings import (
+    Assessment,
+    Code,
+    Configured,
+    Evidence,
+    Finding,
+    FindingState,
+    Why,
+)
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
 from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
@@ -73,6 +82,8 @@ class ConsistencyMonitor:
         self._undetermined: Array | None = None  # by the pairs before
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
+        self.clock_steps = ClockSteps()
+        self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
@@ -143,6 +154,9 @@ class ConsistencyMonitor:
         if self._due is None:
             return
         due, self._due = self._due, None
+        if self.clock_steps.may_be_step:
+            # Pairs across a step would be taken for errors of any parameter.
+            return
         information, pose, configured = due.information, due.pose, due.configured
         if information is not None:
             try:
@@ -175,10 +189,35 @@ class ConsistencyMonitor:
         also = self.acceleration.finding()
         also_found = () if also is None else (also,)
         found = (*self.health.findings, *also_found)
+        found = (*found, *self._of_step(due.stamp_ns))
         # A gyro of another unit moves images elsewhere: parts seem still by chance.
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
+
+    def follow_step(self, step: ClockStep) -> None:
+        """Go on after a step of the time offset, which is then as unknown as at the start."""
+        self.restart()
+        self._step = step.after_ns, _finding_of_step(step)
+
+    def _of_step(self, stamp_ns: int) -> tuple[Finding, ...]:
+        """The finding on the last step, for some seconds after its trial."""
+        if self._step is None or self.clock_steps.on_trial:
+            return ()
+        end_ns, found = self._step
+        return (found,) if stamp_ns < end_ns + posterior.WINDOW_NS else ()
+
+    def restart(self) -> None:
+        """Forget the pairs so far, but not what agreement with the gyro is."""
+        self._recursion = Posterior()
+        self.rotations.clear()
+        self.acceleration.clear()
+        self._directions.clear()
+        self.clock_steps.end_doubt()
+        self._inconsistent, self._gross = [], ()
+        self._likely, self._undetermined = np.zeros(LIVE.size), None
+        self._due = self.latest = self._step = None
+        self.calibration = posterior.NOTHING_ESTIMATED
 
     def _compare_directions(self, due: _Due) -> None:
         """Compare other directions of the readout while the configuration is inconsistent."""
@@ -192,13 +231,33 @@ class ConsistencyMonitor:
         return sum((one.deviation for one in self._inconsistent), np.zeros(LIVE.size))
 
 
+def _finding_of_step(step: ClockStep) -> Finding:
+    measured = {'before_ns': step.before_ns, 'after_ns': step.after_ns}
+    return Finding(
+        Code.OFFSET_STEP,
+        FindingState.SUSPECT,
+        Why.STEPPED,
+        estimated=(step.seconds,),
+        sigma=step.sigma,
+        unit='s',
+        evidence=Evidence(pairs=len(step.pairs), log_likelihood=step.gain, measured=measured),
+    )
+
+
 def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
     """The pose without its values, and the reason, if these are outside of their covariance."""
-    if health.state is not findings.FindingState.WRONG or not np.isfinite(pose.R).all():
+    if health.state is not findings.FindingState.WRONG:
+        return pose
+    return withheld(pose, findings_text.line(health.faults[0]))
+
+
+def withheld(pose: RelativePose, reason: str) -> RelativePose:
+    """The pose without its values, if it has any."""
+    if not np.isfinite(pose.R).all():
         return pose
     return RelativePose(
         status=Status.WITHHELD,
-        reason=findings_text.line(health.faults[0]),
+        reason=reason,
         inliers=pose.inliers,
         diagnostics=Diagnostics(
             model=pose.diagnostics.model,
@@ -335,6 +394,16 @@ class Applied:
     readout_time: float = 0.0  # [s]
     # [s] beyond the configured rows that the IMU must cover, too, for a longer readout time.
     margin: float = 0.0
+    stepped: float = 0.0  # [s] sum of the steps of the time offset that were found
+
+    @property
+    def offset(self) -> float:
+        """All of the time offset beyond the parameter [s]."""
+        return self.stepped + self.time_offset
+
+    def after_step(self, seconds: float) -> Applied:
+        """The corrections after a step of the time offset."""
+        return replace(self, stepped=self.stepped + seconds)
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
         """One step towards the estimate, or back to zero if the parameter is not tracked."""
@@ -365,4 +434,4 @@ class Applied:
             ),
         )
         ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
-        return Applied(offset, readout, max(readout + ahead, 0.0))
+        return Applied(offset, readout, max(readout + ahead, 0.0), self.stepped)

@@ -16,13 +16,13 @@ from rs_relpose_ros.calibration.assessment import configured_sigmas
 from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import PairData
 from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
-from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.config.settings import Parameters, sensor_model, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
@@ -30,7 +30,13 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import pair
-from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
+from rs_relpose_ros.pipeline.monitor import (
+    Applied,
+    ConsistencyMonitor,
+    suppressed,
+    Tracked,
+    withheld,
+)
 from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result, TrackHistory
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
 from rs_relpose_ros.pipeline.still_view import StillView
@@ -46,6 +52,10 @@ _ROTATION_FRAMES = 3
 # Least time between two published pairs with too few matches [s]: in the dark each frame creates
 # one. [chosen: two a second are enough for a display]
 _UNMATCHED_PERIOD = 0.5
+# Reason for a pair whose images contradict the gyro. [derived: text for people]
+_STEP_SOUGHT = (
+    'images and gyro contradict each other, other than before: a step of a clock is looked for'
+)
 # Reason for a pair without the accelerometer. [derived: text for people]
 _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
@@ -334,18 +344,17 @@ class Pipeline(Processor[PairResult]):
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
         configured = self._configured(frame, since, sensor, parameters)
+        stamps_ns = history.stamp_ns, frame.stamp_ns
+        contradicts = monitor.clock_steps.add(stamps_ns, since, data, pose)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
-            pose = monitor.agreement.enlarged(
-                history.stamp_ns,
-                frame.stamp_ns,
-                pose,
-                assessed,
-            )
-        tracked = Tracked.of(monitor.calibration, configured)
-        self.applied = self.applied.moved(tracked, parameters.sensor)
+            pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
         if parameters.pair.withhold_when_wrong:
             pose = suppressed(pose, monitor.health)
+            if contradicts or monitor.clock_steps.in_doubt:
+                pose = withheld(pose, _STEP_SOUGHT)
+        tracked = Tracked.of(monitor.calibration, configured)
+        self._correct(tracked, configured)
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         latest = monitor.latest
         return replace(
@@ -357,6 +366,22 @@ class Pipeline(Processor[PairResult]):
             image2=frame.image if self._keep_images else None,
         )
 
+    def _correct(self, tracked: Tracked, configured: Configured) -> None:
+        """Move the corrections of the next frames towards the estimates, or by a step."""
+        monitor = self._monitor
+        steps = monitor.clock_steps
+        if (wrong := steps.refuted()) is not None:
+            self.applied = self.applied.after_step(-wrong.seconds)
+            monitor.restart()
+        elif (step := steps.found()) is not None:
+            self.applied = self.applied.after_step(step.seconds)
+            monitor.follow_step(step)
+        else:
+            if not steps.in_doubt:
+                self.applied = self.applied.moved(tracked, configured.sensor)
+            return
+        self._rotation = None  # the gyro since then is that of another time
+
     def _configured(
         self, frame: Frame[Any], since: ImuSlice, sensor: Sensor, parameters: Parameters
     ) -> Configured:
@@ -367,7 +392,7 @@ class Pipeline(Processor[PairResult]):
             seconds_between(before_ns, stamp_ns) - parameters.sensor.time_offset_reference_interval
         )
         configured = Configured(
-            parameters.sensor,
+            _with_step(parameters.sensor, self.applied.stepped),
             sensor.camera,
             bias,
             configured_sigmas(
@@ -401,6 +426,14 @@ class Pipeline(Processor[PairResult]):
             if used and not acceleration.uses(evidence):
                 pose = estimate(problem.without_inertial(_CONTRADICTED))
         return pose
+
+
+def _with_step(sensor: SensorConfig, seconds: float) -> SensorConfig:
+    """The configuration after a step of the time offset; its error is tracked from then on."""
+    if not seconds:
+        return sensor
+    offset = sensor.time_offset + seconds
+    return validate.replaced(sensor, time_offset=offset, track_time_offset=True)
 
 
 def _measurement(

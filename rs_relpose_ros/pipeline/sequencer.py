@@ -198,7 +198,7 @@ class Sequencer:
         self._intervals = timing.FrameIntervals()
         self._previous_ns: int | None = None  # reference time of the frame taken before
         # Tracked corrections: of the time offset, and a margin around a frame [ns].
-        self._offset_ns = self._margin_ns = 0
+        self._offset_ns = self._margin_ns = self._stepped_ns = 0
         self._imu_doubt = EXACT  # of the last gyro sample
         # Number of jumps in time: when frames came, and as they are taken.
         self._generation = 0
@@ -312,7 +312,12 @@ class Sequencer:
         The IMU data of a frame then depend only on the frames before it.
         """
         with self._changed:
-            self._offset_ns = to_nanoseconds(applied.time_offset)
+            stepped_ns = to_nanoseconds(applied.stepped)
+            if stepped_ns != self._stepped_ns:
+                # The gyro since the frame before would be that of another time.
+                self._previous_ns = None
+            self._stepped_ns = stepped_ns
+            self._offset_ns = stepped_ns + to_nanoseconds(applied.time_offset)
             self._margin_ns = to_nanoseconds(applied.margin)
 
     def take(self, timeout: float = 0.0) -> Frame[Any] | FrameRefused | None:
@@ -361,7 +366,7 @@ class Sequencer:
             previous_ns = self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
-            frame.applied_offset_ns = self._offset_ns
+            frame.applied_offset_ns = self._offset_ns - self._stepped_ns
             frame.imu_data = frame_imu(
                 self._buffer,
                 span_ns,

@@ -1,0 +1,63 @@
+"""Steps of a clock in the middle of a recording: found, named, and followed."""
+
+import pytest
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration.findings import Code, NOT_EVALUATED, worst_of
+from rs_relpose_ros.calibration.findings_text import line
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.messages.incoming import Role
+from rs_relpose_ros.offline.replay import Replay
+
+SECOND = 1_000_000_000
+
+
+def stepping(replay, sensor, seconds, after):
+    """The messages of a replay; a clock is set by `seconds` once, `after` seconds of the bag."""
+    begin = None
+    for role, message in type(replay).messages_as_recorded(replay):
+        stamp = message.message.header.stamp
+        stamp_ns = stamp.sec * SECOND + stamp.nanosec
+        begin = begin or stamp_ns
+        if (role is Role.IMU) == (sensor == 'imu') and stamp_ns >= begin + after * SECOND:
+            stamp.sec, stamp.nanosec = divmod(stamp_ns + round(seconds * SECOND), SECOND)
+        yield role, message
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'seconds', 'after'), [('camera', 0.026, 2.5), ('imu', 0.07, 2.2)]
+)
+def test_a_clock_that_steps_is_named_and_followed(
+    bundled_bag, monkeypatch, sensor, seconds, after
+):
+    parameters = read_parameters(bundled_bag.with_name(bundled_bag.name + '.yaml'))
+    monkeypatch.setattr(Replay, 'messages_as_recorded', Replay._messages, raising=False)
+    monkeypatch.setattr(
+        Replay, '_messages', lambda replay: stepping(replay, sensor, seconds, after)
+    )
+    with open_bag(bundled_bag) as bag:
+        replay = Replay(bag, bag.find_topics(needs_camera_info=True), parameters)
+        pairs = list(replay.pairs())
+        health = NOT_EVALUATED
+        for pair in pairs:
+            health = worst_of(health, pair.health)
+        health = worst_of(health, replay.health)
+    step = -seconds if sensor == 'camera' else seconds
+    (found,) = health.faults
+    assert found.code is Code.OFFSET_STEP
+    assert found.estimate == pytest.approx(step, abs=4.0 * found.sigma)
+    assert 'stepped by' in line(found)
+    # Between the images that it names.
+    begin = pairs[0].reference_stamp_ns
+    measured = found.evidence.measured
+    assert measured['before_ns'] < begin + (after + 0.2) * SECOND
+    assert measured['after_ns'] > begin + (after - 0.2) * SECOND
+    # No pose of a pair in between, and poses again with the new offset, which is refined.
+    applied = [pair for pair in pairs if pair.applied.stepped]
+    assert applied
+    for pair in pairs:
+        if measured['before_ns'] < pair.stamp_ns <= applied[0].stamp_ns:
+            assert pair.pose.status in (Status.WITHHELD, Status.NO_CONSENSUS)
+    assert sum(bool(pair.pose) for pair in applied[1:]) >= 4
+    assert applied[-1].applied.offset == pytest.approx(step, abs=1e-3)
