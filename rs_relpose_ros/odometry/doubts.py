@@ -23,22 +23,43 @@ _GYRO_SCALE = 0.02
 # 1 sigma of the angles between the axes of the gyro [rad], likewise.
 # [chosen: 0.003 to 0.01 would do: data sheets have 0.1 to 1 % of cross-axis sensitivity]
 _GYRO_SKEW = 0.005
+# 1 sigma of the lag of the accelerometer behind the gyro [s], as of filters in the IMU. A smaller
+# one excludes filters of 20 Hz, a larger one delays starts.
+# [chosen: 3 to 15 ms would do: first-order filters of 10 to 50 Hz lag by 3 to 16 ms]
+_ACCEL_LAG = 5e-3
+# 1 sigma of deviations of the images whose own sigma is not configured: nobody has said that they
+# are exact. Smaller ones exclude errors that pairs do not show within seconds, larger ones delay
+# starts. [measured: docs/lab/odometry.md, "Deviations that nobody stated"]
+_UNSTATED = {
+    'axes': 0.01,  # [rad]
+    'time_offset': 4e-3,  # [s]
+    'readout_time': 5e-4,  # [s]
+    'focal_log': 0.01,
+    'principal_point': 5.0,  # [px]
+}
 
 # Size of the position of the camera on the body, with which the vector begins.
 ARM = slice(0, 3)
-# Sizes of the last parts of the vector by name: the symmetric gyro matrix.
-_GYRO_PARTS = {'gyro_scale': slice(-6, -3), 'gyro_skew': slice(-3, None)}
+# Places of the last parts of the vector by name: symmetric gyro matrix, lag of the accelerometer.
+_IMU_PARTS = {
+    'gyro_scale': slice(-7, -4),
+    'gyro_skew': slice(-4, -1),
+    'accel_lag': slice(-1, None),
+}
 # Number of values of the gyro matrix. [derived: of a symmetric matrix of 3 rows]
 _GYRO_MATRIX = 6
+# Number of values of both sensors of the IMU: the gyro matrix and the lag of the accelerometer.
+_SENSORS = _GYRO_MATRIX + 1
 # Share of the readout between the stamped and the middle row, by `stamp_row`.
 _MIDDLE_SHARES = {'first': 0.5, 'middle': 0.0, 'last': -0.5}
 
 
 class Doubts:
-    """The vector d (3 + k + 6,) of a graph: position of the camera on the body, k deviations.
+    """The vector d (3 + k + 7,) of a graph: position of the camera on the body, k deviations.
 
-    The k deviations are those of IMAGES whose sigma is configured: all others are taken as
-    exact. The last six are the scale and the skew of the gyro, as of `core.deviations`.
+    The k deviations are those of IMAGES that are not exact, by their configured sigma or by that
+    of `_UNSTATED`. The last seven are the scale and the skew of the gyro, as of `core.deviations`,
+    and the time by which the accelerometer is later than the gyro.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -56,12 +77,14 @@ class Doubts:
                 sigmas[self.active],
                 np.full(3, _GYRO_SCALE),
                 np.full(3, _GYRO_SKEW),
+                [_ACCEL_LAG],
             ]
         )
         self.size = len(self.prior_sigmas)
-        # Places of the deviations of the images and of the gyro matrix.
-        self.images = slice(ARM.stop, self.size - _GYRO_MATRIX)
-        self.gyro_matrix = slice(self.images.stop, self.size)
+        # Places of the deviations of the images, of the IMU and of the gyro matrix among those.
+        self.images = slice(ARM.stop, self.size - _SENSORS)
+        self.sensors = slice(self.images.stop, self.size)
+        self.gyro_matrix = slice(self.images.stop, self.size - 1)
         self.prior = np.zeros(self.size)
         self.prior[ARM] = -self.R_cam_body_configured.T @ lever
         # Derivatives (4, k) of the rotation of the camera and of the delay of its keyframes, the
@@ -98,14 +121,17 @@ class Doubts:
             for name, columns in IMAGES.parts.items()
             if sigmas[columns].any()
         }
-        for name, columns in _GYRO_PARTS.items():
+        for name, columns in _IMU_PARTS.items():
             named[name] = d[columns].tolist(), all_sigmas[columns].tolist()
         return named
 
 
 def _configured_sigmas(parameters: Parameters) -> Array:
     """Sigmas of the deviations of IMAGES; 0 for one that is taken as exact."""
-    configured = parameters.deviation_sigmas()
+    configured = {
+        name: sigma or _UNSTATED.get(name, 0.0)
+        for name, sigma in parameters.deviation_sigmas().items()
+    }
     # A parameter that relpose_node tracks is not constant: its deviation is no unknown.
     if parameters.sensor.track_time_offset:
         configured['time_offset'] = 0.0

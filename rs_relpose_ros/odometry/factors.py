@@ -7,7 +7,7 @@ keyframes share the vector ``L(0)`` of `doubts`.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
@@ -64,6 +64,9 @@ _IMU_ROWS = 15
 _OF_GYRO_1 = slice(IMU['B1'].start + 3, IMU['B1'].stop)
 # The same of the second keyframe.
 _OF_GYRO_2 = slice(IMU['B2'].start + 3, IMU['B2'].stop)
+# Columns of velocity and position of the second keyframe, the latter in the axes of its body.
+_OF_VELOCITY_2 = IMU['V2']
+_OF_PLACE_2 = slice(IMU['X2'].start + 3, IMU['X2'].stop)
 
 
 # -- the IMU ----------------------------------------------------------------------------------
@@ -91,23 +94,35 @@ def accel_variance(imu: ImuConfig) -> float:
     return max(imu.accel_noise_density, _LEAST_ACCEL_NOISE) ** 2
 
 
+class Motion(NamedTuple):
+    """What the samples of an interval say of the doubts about the IMU."""
+
+    rate: Array  # (3,) mean rate of the gyro without its bias [rad/s]
+    # (2, 3) change of velocity [m/s] and position [m] in the world by a lag of the accelerometer,
+    # per second of it.
+    by_lag: Array
+    R: Array  # (3, 3) of the body at the end
+
+
 def imu_factor(
     k: int,
     pim: Any,
-    rate: Array,
+    motion: Motion,
     unknown: Doubts,
 ) -> Any:
     """The samples between the keyframes k and k + 1.
 
-    `pim`: ``gtsam.PreintegratedCombinedMeasurements``; `rate` (3,): mean rate of the gyro without
-    its bias. The gyro matrix changes the rate by ``M rate``, as a change of the bias by
-    ``-M rate`` does: the residual is linear in it to 1e-6 rad.
+    `pim`: ``gtsam.PreintegratedCombinedMeasurements``. The gyro matrix changes the rate by
+    ``M rate``, as a change of the bias by ``-M rate`` does: the residual is linear in it to 1e-6
+    rad. A lag changes the integrals of the specific force.
     """
     x1, v1, b1 = X(k), V(k), B(k)
     x2, v2, b2 = X(k + 1), V(k + 1), B(k + 1)
     inner = gtsam.CombinedImuFactor(x1, v1, x2, v2, b1, b2, pim)
-    common, matrix = L(0), unknown.gyro_matrix
-    by_matrix = -by_gyro_matrix(rate)
+    common, sensors = L(0), unknown.sensors
+    by_matrix = -by_gyro_matrix(motion.rate)
+    velocity_by_lag, position_by_lag = motion.by_lag
+    place_by_lag = motion.R.T @ position_by_lag
     blocks = tuple(IMU.values())
 
     def error(
@@ -117,13 +132,15 @@ def imu_factor(
     ) -> Array:
         A, negative = inner.linearize(values).jacobian()
         of_matrix = (A[:, _OF_GYRO_1] + A[:, _OF_GYRO_2]) @ by_matrix
+        of_lag = A[:, _OF_VELOCITY_2] @ velocity_by_lag + A[:, _OF_PLACE_2] @ place_by_lag
+        of_sensors = np.column_stack([of_matrix, -of_lag])
         if jacobians is not None:
             for number, columns in enumerate(blocks):
                 jacobians[number] = np.asfortranarray(A[:, columns])
             by_doubts = np.zeros((_IMU_ROWS, unknown.size), order='F')
-            by_doubts[:, matrix] = of_matrix
+            by_doubts[:, sensors] = of_sensors
             jacobians[len(blocks)] = by_doubts
-        return np.asarray(of_matrix @ values.atVector(common)[matrix] - negative)
+        return np.asarray(of_sensors @ values.atVector(common)[sensors] - negative)
 
     noise = gtsam.noiseModel.Unit.Create(_IMU_ROWS)
     return gtsam.CustomFactor(noise, [x1, v1, x2, v2, b1, b2, common], error)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration.findings import Finding
 from rs_relpose_ros.config.settings import Parameters
@@ -51,6 +52,10 @@ _STILL_GATE = 4.0
 # to 2 cm/s each sigma is large, and no slow camera would start; without it wrong starts happened
 # in slow motion. [measured: docs/lab/odometry.md, "Starts", slow motion]
 _LEAST_SPEED = 0.1
+# Least variance of a pair by that of its images, after the start. A smaller one makes states too
+# certain, as errors of consecutive pairs persist; a larger one makes all states too uncertain.
+# [measured: docs/lab/odometry.md, "Noise by innovations", least variance]
+_LEAST_VARIANCE = 0.7
 # Largest share of the window that one interval takes. A longer bridge would push the states before
 # it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
 _LONGEST_STEP = 0.25
@@ -113,8 +118,8 @@ class KeyframeState:
     velocity: Array
     gyro_bias: Array
     accel_bias: Array
-    doubts: Array  # (3 + k + 6,) of `doubts.Doubts`
-    # (18 + k + 6, 18 + k + 6) of rotation and translation in the axes of the body, velocity in the
+    doubts: Array  # (3 + k + 7,) of `doubts.Doubts`
+    # (18 + k + 7, 18 + k + 7) of rotation and translation in the axes of the body, velocity in the
     # world, biases of accelerometer and gyro, doubts.
     covariance: Array
 
@@ -137,11 +142,11 @@ class _Step(NamedTuple):
 
     interval: ImuInterval | None
     pim: Any  # their integral, of gtsam
-    rate: Array  # (3,) mean rate of the gyro without its bias [rad/s]
+    motion: factors.Motion
 
 
 # No samples.
-_NO_STEP = _Step(None, None, np.zeros(3))
+_NO_STEP = _Step(None, None, factors.Motion(np.zeros(3), np.zeros((2, 3)), np.eye(3)))
 
 
 def _optimizer(iterations: int) -> Any:
@@ -252,6 +257,7 @@ class KeyframeGraph:
         is not used; with a gate, its covariance is larger by an innovation above 1, too.
         """
         i, j = self._count - 1, self._count
+        self._noise.expect(interval, self._imu)
         step = self._predicted(interval)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(X(j), self._ahead.atPose3(X(j)))
@@ -303,15 +309,14 @@ class KeyframeGraph:
     ) -> float:
         """Variance of a pair by that of its images.
 
-        Without a gate, at a start, the misfit shows what is wrong. Later the variance is no
-        smaller than that of the images, as innovations hide errors that persist: without this
-        bound 6 % of the rotations are beyond the 99.7 % quantile, with it 0.1 %. Nor is it smaller
-        than the innovation allows: a pair of a moving object has one of 4 to 16, and the path
-        would follow it. [measured: docs/lab/odometry.md, "Noise by innovations", "Disturbances"]
+        Without a gate, at a start, the misfit shows what is wrong. Later the variance is bounded
+        below, as innovations hide errors that persist. Nor is it smaller than the innovation
+        allows: a pair of a moving object has one of 4 to 16, and the path would follow it.
+        [measured: docs/lab/odometry.md, "Disturbances"]
         """
         variance = self._noise.pair_variance
         if gate < math.inf:
-            variance = max(variance, 1.0) * max(innovation, 1.0)
+            variance = max(variance, _LEAST_VARIANCE) * max(innovation, 1.0)
         return variance
 
     def scale_sigma(self) -> float:
@@ -424,7 +429,7 @@ class KeyframeGraph:
 
     def _imu_factor(self, step: _Step) -> Any:
         """The samples of a step as a factor."""
-        return factors.imu_factor(self._count - 1, step.pim, step.rate, self._doubts)
+        return factors.imu_factor(self._count - 1, step.pim, step.motion, self._doubts)
 
     def _predicted(self, interval: ImuInterval) -> _Step:
         """Predict the next keyframe in `_ahead`.
@@ -444,13 +449,17 @@ class KeyframeGraph:
         )
         self._integrate(pim, new)
         rate = _mean_rate(interval) - self._bias.gyroscope()
-        self._step = _Step(interval, pim, rate)
-        matrix = self.newest.doubts[self._doubts.gyro_matrix]
+        *matrix, lag = self.newest.doubts[self._doubts.sensors]
         change = -by_gyro_matrix(rate) @ matrix
         bias = factors.changed_bias(self._bias, change)
         state = pim.predict(self._nav_state, bias)
-        self._ahead.update(X(self._count), state.pose())
-        self._ahead.update(V(self._count), state.velocity())
+        R = state.pose().rotation()
+        by_lag = _by_lag(interval, gtsam.Rot3.Logmap(pim.deltaRij())) @ self.newest.R.T
+        velocity, position = lag * by_lag
+        pose = gtsam.Pose3(R, state.position() + position)
+        self._ahead.update(X(self._count), pose)
+        self._ahead.update(V(self._count), state.velocity() + velocity)
+        self._step = _Step(interval, pim, factors.Motion(rate, by_lag, R.matrix()))
         return self._step
 
     def _integrate(self, pim: Any, interval: ImuInterval) -> None:
@@ -588,6 +597,22 @@ class KeyframeGraph:
         self._step = _NO_STEP
         if self._record is not None:
             self._record[1].insert_or_assign(values)
+
+
+def _by_lag(interval: ImuInterval, turn: Array) -> Array:
+    """Change (2, 3) of the integrals of the force by a lag of the accelerometer, per second.
+
+    Of velocity and position, in the axes at the begin; `turn` (3,): rotation vector over the
+    interval. The true force is later in the samples: its derivative is integrated.
+    """
+    seconds = interval.seconds - interval.seconds[0]
+    steps = np.diff(seconds)
+    middle = seconds[:-1] + 0.5 * steps
+    turns = Rotation.from_rotvec(np.outer(middle / seconds[-1], turn))
+    changes = turns.apply(np.diff(interval.forces, axis=0))
+    velocity = np.cumsum(changes, axis=0)
+    position = steps @ (velocity - 0.5 * changes)
+    return np.stack([velocity[-1], position])
 
 
 def _ways(values: Any, newest: int) -> Array:

@@ -16,7 +16,7 @@ from rs_relpose_ros.imu.buffer import ImuInterval
 # axes, vibration, clock), from which innovations choose. A shorter list could not follow a bad
 # accelerometer.
 # [measured: docs/lab/odometry.md, "Noise by innovations": 0 to 27e-3 on seven recordings]
-_ACCEL_ERRORS = np.array([0.0, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+_ACCEL_ERRORS = np.array([0.0, 1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 # 1 sigma of that density before any innovation. A smaller one starts too certain on recordings, a
 # larger one delays starts. [measured: there, starts of recordings]
 _ACCEL_ERROR_SIGMA = 8e-3
@@ -48,6 +48,13 @@ _NAMED_CHANCE = 1e-2
 # Innovations before which no noise is named: the prior decides until then.
 # [chosen: 10 to 50 would do: some seconds]
 _LEAST_NAMED = 20
+# Variance of the third difference of white noise of unit variance. [derived: 1 + 9 + 9 + 1]
+_THIRD_DIFFERENCE = 20.0
+# Median of the size of a normal variable by its sigma. [derived: of the normal distribution]
+_MEDIAN = 0.6745
+# Fewest samples whose third differences show a noise. Fewer would be too uncertain, more would
+# miss it in short intervals. [chosen: 8 to 20 would do: three axes of each]
+_LEAST_SAMPLES = 10
 # Change of the specific force between two samples [m/s^2] from which its mean is not known: a
 # knock, whose peak lies between the samples. Steps of a walk change it by less at 50 Hz or more; a
 # smaller bound would take them for knocks, a larger one would trust a knock.
@@ -92,16 +99,23 @@ def spread(columns: list[Array], covariance: Array) -> Array:
     return np.asarray(sum(one @ other.T for one, other in zip(columns, weighted, strict=True)))
 
 
-def _prior() -> Array:
+def _prior(accel_sigma: float, gyro_half: float) -> Array:
     """Logarithm (A, G, P) of the prior, without a constant."""
-    accel = -0.5 * (_ACCEL_ERRORS / _ACCEL_ERROR_SIGMA) ** 2
-    gyro = -np.log1p((_GYRO_ERRORS / _GYRO_ERROR_HALF) ** 2)
+    accel = -0.5 * (_ACCEL_ERRORS / accel_sigma) ** 2
+    gyro = -np.log1p((_GYRO_ERRORS / gyro_half) ** 2)
     pair = -0.5 * (np.log(_PAIR_VARIANCES) / _PAIR_LOG_SIGMA) ** 2
     return np.asarray(accel[:, None, None] + gyro[:, None] + pair)
 
 
-# The prior, to which the posterior returns as innovations are forgotten.
-_PRIOR = _prior()
+def noise_of_samples(values: Array, seconds: Array) -> float:
+    """Density of the white noise of samples (K, 3), or of a vibration, by their third differences.
+
+    A motion hardly changes these at the rate of an IMU. A vibration is no white noise: its
+    integral may be smaller.
+    """
+    size = np.median(np.abs(np.diff(values, n=3, axis=0)))
+    sigma = float(size) / (_MEDIAN * math.sqrt(_THIRD_DIFFERENCE))
+    return sigma * math.sqrt(float(np.median(np.diff(seconds))))
 
 
 class NoisePosterior:
@@ -112,8 +126,24 @@ class NoisePosterior:
     """
 
     def __init__(self) -> None:
-        self._log = _PRIOR
+        self._prior = _prior(_ACCEL_ERROR_SIGMA, _GYRO_ERROR_HALF)
+        self._log = self._prior
         self._observed = 0
+        self._read()
+
+    def expect(self, interval: ImuInterval, imu: ImuConfig) -> None:
+        """Widen the prior by the noise that samples show; innovations decide what counts.
+
+        Without it, states of the first seconds with a vibrating IMU would be too certain.
+        """
+        seconds = interval.seconds
+        if len(seconds) < _LEAST_SAMPLES:
+            return
+        accel = _beyond(noise_of_samples(interval.forces, seconds), imu.accel_noise_density)
+        gyro = _beyond(noise_of_samples(interval.rates, seconds), imu.gyro_noise_density)
+        prior = _prior(max(accel, _ACCEL_ERROR_SIGMA), max(gyro, _GYRO_ERROR_HALF))
+        self._log = self._log + (prior - self._prior)
+        self._prior = prior
         self._read()
 
     def observe(self, innovation: Innovation, seconds: float) -> None:
@@ -125,7 +155,7 @@ class NoisePosterior:
         covariances = innovation.covariance + by_accel[:, None] + by_gyro
         log = _log_likelihoods(innovation.errors, covariances)
         kept = math.exp(-seconds / _FORGOTTEN)
-        remembered = kept * self._log + (1.0 - kept) * _PRIOR
+        remembered = kept * self._log + (1.0 - kept) * self._prior
         worse = log - log.max()
         self._log = remembered + np.maximum(worse, -_ONE_PAIR)
         self._observed += 1
@@ -162,6 +192,11 @@ class NoisePosterior:
             self._of_accel,
         )
         return tuple(finding for finding in (gyro, accel) if finding is not None)
+
+
+def _beyond(density: float, configured: float) -> float:
+    """Density of what is added to a noise of the configured density; 0 if it is smaller."""
+    return math.sqrt(max(density**2 - configured**2, 0.0))
 
 
 def _log_likelihoods(errors: Array, covariances: Array) -> Array:

@@ -60,8 +60,9 @@ class Publication(NamedTuple):
         velocity = R.T @ (body.velocity + body.R @ skew(rate) @ arm)
         to_world = self._pose_by_body(body, arm, R_cam_body)
         to_twist = self._twist_by_body(body, arm, rate, velocity, R_cam_body)
-        place = ARM.start + self.unknown.gyro_matrix.start
-        to_twist[:, place:] -= to_twist[:, GYRO_BIAS] @ by_matrix
+        matrix = self.unknown.gyro_matrix
+        columns = slice(DOUBTS.start + matrix.start, DOUBTS.start + matrix.stop)
+        to_twist[:, columns] -= to_twist[:, GYRO_BIAS] @ by_matrix
         by_rate = to_twist[:, GYRO_BIAS] * self.gyro_noise_density * _RATE_NOISE
         of_body = to_world @ body.covariance @ to_world.T
         of_twist = to_twist @ body.covariance @ to_twist.T
