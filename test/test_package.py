@@ -304,6 +304,15 @@ def test_library_is_imported_in_its_folders_only(library, folders):
     assert {str(path.parent.relative_to(ROOT)) for path in users} <= folders
 
 
+def test_nodes_start_without_the_slow_parts_of_scipy():
+    """They would take half of the processor time of the imports of a node."""
+    pytest.importorskip('rclpy')
+    nodes = ('relpose_node', 'odometry_node', 'global_shutter_node')
+    code = '\n'.join(f'import {NAME}.nodes.{node}' for node in nodes)
+    slow = ('scipy.signal', 'scipy.stats', 'scipy.optimize')
+    loaded_after(f'{code}\nassert not {{*{slow!r}}} & {{*sys.modules}}')
+
+
 def test_gtsam_is_imported_where_odometry_runs_only():
     loaded = loaded_by(f'{NAME}.cli', f'{NAME}.nodes', f'{NAME}.odometry.pair')
     assert 'rclpy' in loaded

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration import fit, model
-from rs_relpose_ros.calibration.observations import Observations, Pair
 from rs_relpose_ros.geometry import Array
+
+if TYPE_CHECKING:  # its convolution imports much of SciPy, which no node needs
+    from rs_relpose_ros.calibration.observations import Observations, Pair
 
 # Gain in log-likelihood beyond which columns are certain. Turned images are rare: a smaller value
 # would take noise of a global shutter for them, a larger one would miss them where the camera
