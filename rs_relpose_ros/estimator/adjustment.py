@@ -302,10 +302,16 @@ def path_by_deviations(
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
     path, rotations = _path(state, tracks.duration), _turned(tracks, state)
     used_rows = PATH - RESIDUAL + path_unknowns
-    rows, columns = np.empty((ROWS, 2, BLOCK)), np.empty((D, 2, BLOCK))
-    squares, cross = np.empty(BLOCK), np.zeros((n, D))
+    rows = np.empty((ROWS, 2, BLOCK))
+    columns = np.empty((D, 2, BLOCK))
+    squares = np.empty(BLOCK)
+    cross = np.zeros((n, D))
+    products = np.empty((used_rows, D))
+    sums = np.empty((n + 1, D))
+    solved = np.empty((D, TRACK_UNKNOWNS, BLOCK))
+    used = rows.reshape(ROWS, 2 * BLOCK)[RESIDUAL : RESIDUAL + used_rows]
     for b in range(blocks):
-        mixed, solved = np.zeros((D, TRACK_UNKNOWNS, BLOCK)), np.empty((TRACK_UNKNOWNS, BLOCK))
+        mixed = np.zeros((D, TRACK_UNKNOWNS, BLOCK))
         for v in range(V):
             o = tracks.observations[v, b]
             moves = float(min(v, 1))
@@ -313,15 +319,17 @@ def path_by_deviations(
             place = (v, b * BLOCK)
             observe_changes(o, rows, squares, path, sigma * sigma, changes, place, columns)
             places = _places(v, path_unknowns, n)
+            np.dot(used, columns.reshape(D, 2 * BLOCK).T, products)
             for d in range(D):
                 for y in range(1, used_rows):
-                    cross[places[y], d] += (rows[RESIDUAL + y] * columns[d]).sum()
+                    cross[places[y], d] += products[y, d]
                 for y in range(TRACK_UNKNOWNS):
                     _add_products(rows[y], columns[d], mixed[d, y])
         for d in range(D):
-            solve_lower_groups(normal.factors[b], mixed[d], solved)
-            for x in range(n):
-                cross[x, d] -= (normal.tracks[b, x] * solved).sum()
+            solve_lower_groups(normal.factors[b], mixed[d], solved[d])
+        of_tracks = normal.tracks[b].reshape(n + 1, TRACK_UNKNOWNS * BLOCK)
+        np.dot(of_tracks, solved.reshape(D, TRACK_UNKNOWNS * BLOCK).T, sums)
+        cross -= sums[:n]
     return -inverse(normal.hessian) @ cross
 
 

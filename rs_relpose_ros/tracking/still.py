@@ -69,6 +69,9 @@ class StillParts:
         """Forget all images."""
         self._before: NDArray[np.float32] | None = None  # the last new image, reduced
         self._counted: deque[tuple[int, Flags, Flags]] = deque()
+        # Of these images, in how many each cell was informative, and in how many it was still.
+        self._informative = np.zeros((ROWS, COLUMNS), dtype=int)
+        self._still = np.zeros((ROWS, COLUMNS), dtype=int)
 
     def add(self, stamp_ns: int, image: Image, motion: Array) -> bool:
         """Add the next image (H, W); whether it repeats the last new image.
@@ -95,17 +98,18 @@ class StillParts:
 
     def static(self) -> Flags:
         """Cells (ROWS, COLUMNS) that are static by the images of the last seconds."""
-        if not self._counted:
-            return np.zeros((ROWS, COLUMNS), dtype=bool)
-        _, informative, still = zip(*self._counted, strict=True)
-        counts = np.sum(informative, axis=0)
-        enough = counts >= _LEAST_IMAGES
-        return np.asarray(enough & (np.sum(still, axis=0) >= _STATIC * counts))
+        enough = self._informative >= _LEAST_IMAGES
+        return np.asarray(enough & (self._still >= _STATIC * self._informative))
 
     def _count(self, stamp_ns: int, informative: Flags, still: Flags) -> None:
-        self._counted.append((stamp_ns, informative, still & informative))
+        still = still & informative
+        self._counted.append((stamp_ns, informative, still))
+        self._informative += informative
+        self._still += still
         while self._counted[0][0] < stamp_ns - _WINDOW_NS:
-            self._counted.popleft()
+            _, no_longer_informative, no_longer_still = self._counted.popleft()
+            self._informative -= no_longer_informative
+            self._still -= no_longer_still
 
 
 def cell_centres(width: int, height: int) -> Array:
@@ -131,20 +135,23 @@ def _compared(
     # many image widths, which `remap` would reflect at the border one width at a time.
     known = (np.abs(motion) < width).all(axis=2)  # NaN is not known either
     field = np.where(known[..., np.newaxis], motion, 0.0).astype(np.float32)
+    turned = known & (np.linalg.norm(field, axis=2) >= _LEAST_MOTION)
+    if not turned.any():
+        return turned, turned
     dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u = np.arange(width, dtype=np.float32)
+    v = np.arange(height, dtype=np.float32)
     # The content of a pixel comes from where the motion began.
     moved = cv2.remap(
         before,
         u - dense[..., 0],
-        v - dense[..., 1],
+        v[:, np.newaxis] - dense[..., 1],
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REFLECT,
     )
     expected = _cell_means(np.abs(moved - before))
     changed = _cell_means(np.abs(now - before))
-    turned = np.linalg.norm(field, axis=2) >= _LEAST_MOTION
-    informative = known & turned & (expected >= _LEAST_CHANGE)
+    informative = turned & (expected >= _LEAST_CHANGE)
     return np.asarray(informative), np.asarray(changed < _STILL * expected)
 
 
