@@ -1,11 +1,16 @@
 """Steps of a clock in the middle of a recording: found, named, and followed."""
 
+import numpy as np
 import pytest
+from test_monitor import CONFIGURED
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibration.findings import Code, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import line
+from rs_relpose_ros.calibration.offset_changes import Kind, offset_change
+from rs_relpose_ros.calibration.posterior import Calibration
 from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import Role
 from rs_relpose_ros.offline.replay import Replay
@@ -61,3 +66,52 @@ def test_a_clock_that_steps_is_named_and_followed(
             assert pair.pose.status in (Status.WITHHELD, Status.NO_CONSENSUS)
     assert sum(bool(pair.pose) for pair in applied[1:]) >= 4
     assert applied[-1].applied.offset == pytest.approx(step, abs=1e-3)
+
+
+PAIRS = 80
+STAMPS_NS = np.arange(PAIRS, dtype=np.int64) * 170_000_000
+SECONDS = STAMPS_NS * 1e-9
+
+
+def calibration_of(offsets, seed=3, noise=0.002):
+    """Pairs whose time offsets deviate by `offsets` (N,) [s], each with a `noise` [s]."""
+    rng = np.random.default_rng(seed)
+    k = LIVE.index('time_offset')
+    rows = rng.standard_normal((PAIRS, 20, LIVE.size)) / LIVE.sigmas
+    rows[:, :, k] = rng.standard_normal((PAIRS, 20)) / (noise * np.sqrt(20.0))
+    S = rows.transpose(0, 2, 1) @ rows
+    residuals = rows[:, :, k] * offsets[:, None] + rng.standard_normal((PAIRS, 20))
+    b = np.einsum('nij,ni->nj', rows, residuals)
+    nothing = np.zeros(LIVE.size)
+    # The covariance of all is not needed: hypotheses are solved from S and b.
+    return Calibration(
+        nothing, np.eye(LIVE.size), S, b, np.ones((PAIRS, LIVE.size)), nothing, 1.0, 1.0, 1.0
+    )
+
+
+@pytest.mark.parametrize(('step', 'first'), [(0.0031, 50), (-0.0044, 21)])
+def test_a_small_step_is_located(step, first):
+    found = offset_change(
+        calibration_of(np.where(np.arange(PAIRS) < first, 0.0, step)), STAMPS_NS, CONFIGURED
+    )
+    assert found.kind is Kind.STEP
+    assert found.value == pytest.approx(step, abs=4.0 * found.sigma)
+    assert found.sigma < 7e-4
+    before_ns, after_ns = found.between_ns
+    assert before_ns - 4e8 < STAMPS_NS[first] < after_ns + 4e8
+
+
+@pytest.mark.parametrize('rate', [310e-6, -450e-6])
+def test_a_drift_is_measured(rate):
+    pairs = calibration_of(rate * (SECONDS - 2.0), noise=7e-4)
+    found = offset_change(pairs, STAMPS_NS, CONFIGURED)
+    assert found.kind is Kind.DRIFT
+    assert found.value == pytest.approx(rate, abs=4.0 * found.sigma)
+    assert found.now == pytest.approx(rate * (SECONDS[-1] - 2.0), abs=1.5e-3)
+
+
+@pytest.mark.parametrize('offset', [0.0, 0.005])
+@pytest.mark.parametrize('seed', range(5))
+def test_a_constant_offset_is_no_change(offset, seed):
+    pairs = calibration_of(np.full(PAIRS, offset), seed)
+    assert offset_change(pairs, STAMPS_NS, CONFIGURED) is None

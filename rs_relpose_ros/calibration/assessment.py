@@ -183,13 +183,13 @@ def _ranked(
     selected: NDArray[np.bool_],
     estimated: Calibration,
     configured: Configured,
-) -> list[tuple[Quantity, _Solution]]:
+) -> list[tuple[Quantity, Solution]]:
     """Hypotheses that free one more quantity each.
 
     Those that are certain come first, and of these the one with most evidence.
     """
 
-    def rank(hypothesis: tuple[Quantity, _Solution]) -> tuple[bool, float]:
+    def rank(hypothesis: tuple[Quantity, Solution]) -> tuple[bool, float]:
         quantity, solution = hypothesis
         is_certain = solution.certainty(quantity.part) >= _CERTAIN
         return not is_certain, -solution.evidence(quantity)
@@ -214,6 +214,23 @@ def likely(estimated: Calibration, configured: Configured) -> Array:
     )[0]
     return np.where(
         _parts_of(quantity) & (solution.certainty(quantity.part) > _LIKELY), solution.off, 0.0
+    )
+
+
+def offset_hypotheses(
+    estimated: Calibration, configured: Configured
+) -> tuple[Solution, Solution, float]:
+    """Solutions with a configured and with a free time offset, and the best other evidence.
+
+    That is the chi-square in favour of the other quantity that explains the pairs best.
+    """
+    none = np.zeros(LIVE.size, dtype=bool)
+    others = [one for one in findings.QUANTITIES if one.code is not Code.TIME_OFFSET]
+    best, solution = _ranked(others, none, estimated, configured)[0]
+    return (
+        _solved(none, estimated, configured),
+        _solved(LIVE.mask('time_offset'), estimated, configured),
+        solution.evidence(best),
     )
 
 
@@ -259,7 +276,7 @@ def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
     return LIVE.mask(quantity.entry)
 
 
-class _Solution(NamedTuple):
+class Solution(NamedTuple):
     """Deviations that fit the pairs, if some are free."""
 
     off: Array  # (K,) from the active values
@@ -316,7 +333,7 @@ class _Solution(NamedTuple):
         return math.sqrt(gain * min(gain / max(scattered, 1e-12), 1.0))
 
 
-def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
+def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> Solution:
     """Deviations, those `free` (K,) within their wide prior, others within configured sigmas."""
     sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
     if free.any():
@@ -329,11 +346,11 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     scale = np.outer(sigmas, sigmas)
     covariance = inverse(scale * S / misfit + np.eye(len(sigmas))) * scale
     off = covariance @ (estimated.b.sum(axis=0) - S @ active) / misfit
-    return _Solution(off, covariance, estimated, active)
+    return Solution(off, covariance, estimated, active)
 
 
 def _inconsistency(
-    quantity: Quantity, solution: _Solution, certainty: float, effects: Sequence[Effect]
+    quantity: Quantity, solution: Solution, certainty: float, effects: Sequence[Effect]
 ) -> Inconsistency:
     deviation = np.where(_parts_of(quantity), solution.off, 0.0)
     shift, claimed = (

@@ -61,6 +61,7 @@ class Code(str, Enum):
     REPEATED_IMAGES = 'repeated_images'
     STATIC_REGION = 'static_region'
     OFFSET_STEP = 'offset_step'
+    OFFSET_DRIFT = 'offset_drift'
     # Causes that the odometry names.
     GYRO_NOISE = 'gyro_noise'
     ACCEL_NOISE = 'accel_noise'
@@ -110,6 +111,7 @@ class Why(str, Enum):
     RECTIFIED = 'rectified'
     STILL = 'still'  # images or parts of them, though the camera turns
     STEPPED = 'stepped'  # a clock was set while the sensors ran
+    DRIFTING = 'drifting'  # a clock runs at another rate
     # Gross errors: `is_gross`.
     GROSS = 'gross'
     LEFT_HANDED = 'left_handed'

@@ -309,6 +309,16 @@ def _offset_step(finding: Finding) -> Text:
     )
 
 
+def _offset_drift(finding: Finding) -> Text:
+    assert finding.estimate is not None and finding.sigma is not None
+    rate, sigma = 1e6 * finding.estimate, 1e6 * finding.sigma
+    return Text(
+        f'the time offset between camera and IMU drifts by {rate:.0f} +- {sigma:.0f} ppm: it is '
+        'followed from now on',
+        'have both sensors stamped by one clock',
+    )
+
+
 def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
@@ -333,6 +343,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,
     (Code.OFFSET_STEP, Why.STEPPED): _offset_step,
+    (Code.OFFSET_DRIFT, Why.DRIFTING): _offset_drift,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
     (Code.KNOCK, Why.OFF): _knock,

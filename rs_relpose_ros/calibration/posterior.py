@@ -39,7 +39,7 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.motion import FrameMotion, rotations_at_rate
-from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.geometry.timing import seconds_between, Stamps, to_nanoseconds
 from rs_relpose_ros.imu.integration import ImuSlice
 
 # Sigma of the velocities about the mean one [baselines per second]. A smaller one takes a change
@@ -486,7 +486,7 @@ def middle_share(camera: RollingShutterCamera) -> float:
 _TIMES = [_OFFSET, _READOUT]
 
 
-def _at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairData | None:
+def at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairData | None:
     """The pair with rows at the times of the deviations, not yet fitted.
 
     `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.
@@ -651,12 +651,38 @@ class Posterior:
                     first, second = (other, gyro) if n < k else (gyro, other)
                     if first.stamps_ns[-1] == second.stamps_ns[0]:
                         gyro = first.joined(second)
-                if (moved := _at_other_times(data, gyro, later)) is not None:
+                if (moved := at_other_times(data, gyro, later)) is not None:
                     data, active = moved, active.copy()
                     active[_TIMES] = last.about[_TIMES]
             if (information := pair_information(data, active, last.about)) is not None:
                 self._pairs[k] = self._pairs[k]._replace(about=last.about, information=information)
         return bool(chosen)
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """Stamps (N,) of the pairs."""
+        return np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
+
+    def follow_offsets(self, offsets: Array, first: int = 0) -> None:
+        """Refer the pairs from `first` on to a configuration whose offset is `offsets` (N,) later.
+
+        Each pair has its own of N values [s]; pairs before `first` are dropped.
+        """
+        kept = list(self._pairs)[first:]
+        self._pairs.clear()
+        for pair, offset in zip(kept, offsets[first:], strict=True):
+            change = np.zeros(LIVE.size)
+            change[_OFFSET] = offset
+            information = replace(
+                pair.information, b=pair.information.b - pair.information.S @ change
+            )
+            self._pairs.append(
+                pair._replace(
+                    active=pair.active - change,
+                    about=pair.about - change,
+                    information=information,
+                )
+            )
 
     def solved(self) -> Calibration:
         """The calibration that fits all pairs."""

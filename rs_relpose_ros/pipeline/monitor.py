@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
+from rs_relpose_ros.calibration.offset_changes import Kind, offset_change, OffsetChange
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
 from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
@@ -84,6 +86,8 @@ class ConsistencyMonitor:
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self.clock_steps = ClockSteps()
         self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
+        self._drift: Finding | None = None  # that is followed
+        self.offset_change: OffsetChange | None = None  # by the pairs so far, not followed yet
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
@@ -167,6 +171,9 @@ class ConsistencyMonitor:
                 self._inconsistent = assessment.find_inconsistencies(
                     self.calibration, self._on_poses or self._on_rotations, configured
                 )
+                self.offset_change = offset_change(
+                    self.calibration, self._recursion.stamps_ns, configured
+                )
                 self._likely = (
                     self._deviation()
                     if self._inconsistent
@@ -189,23 +196,77 @@ class ConsistencyMonitor:
         also = self.acceleration.finding()
         also_found = () if also is None else (also,)
         found = (*self.health.findings, *also_found)
-        found = (*found, *self._of_step(due.stamp_ns))
+        found = (*found, *self._of_changes(due.stamp_ns))
         # A gyro of another unit moves images elsewhere: parts seem still by chance.
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
 
-    def follow_step(self, step: ClockStep) -> None:
-        """Go on after a step of the time offset, which is then as unknown as at the start."""
-        self.restart()
-        self._step = step.after_ns, _finding_of_step(step)
+    def follow_step(self, step: ClockStep, configured: Configured) -> None:
+        """Go on after a step of the time offset, with what the pairs after it say.
 
-    def _of_step(self, stamp_ns: int) -> tuple[Finding, ...]:
-        """The finding on the last step, for some seconds after its trial."""
+        `configured` has the offset after the step. Nothing is kept of the pairs before: the
+        offset is as unknown as at the start.
+        """
+        self.restart()
+        between_ns = step.before_ns, step.after_ns
+        found = _finding_of_step(step.seconds, step.sigma, between_ns, step.gain, len(step.pairs))
+        self._step = step.after_ns, found
+        moved = np.zeros(LIVE.size)
+        moved[LIVE.index('time_offset')] = step.seconds
+        whole = self.clock_steps.joined
+        assert whole is not None
+        for pair in step.pairs:
+            at_step = posterior.at_other_times(pair.data, whole, moved)
+            if at_step is None:
+                continue
+            with suppress(np.linalg.LinAlgError):  # a pair without rank says nothing
+                self._recursion.add(pair.stamp_ns, at_step, configured.active, configured.active)
+        self.calibration = self._recursion.solved()
+
+    def follow_change(self, change: OffsetChange, drift: float) -> None:
+        """Go on after a small step or with a drift of the time offset, which is then `drift`.
+
+        The pairs are referred to the configuration that follows the change.
+        """
+        stamps_ns = self._recursion.stamps_ns
+        begin_ns, end_ns = change.between_ns
+        offsets, first = np.full(len(stamps_ns), change.now), 0
+        if change.kind is Kind.STEP:
+            first = int(np.searchsorted(stamps_ns, end_ns))
+            found = _finding_of_step(
+                change.value, change.sigma, change.between_ns, change.gain, change.pairs
+            )
+            self._step = end_ns, found
+        else:
+            offsets += 1e-9 * change.value * (stamps_ns - end_ns)
+            evidence = Evidence(
+                pairs=change.pairs,
+                log_likelihood=change.gain,
+                measured={'first_ns': begin_ns, 'last_ns': end_ns},
+            )
+            self._drift = Finding(
+                Code.OFFSET_DRIFT,
+                FindingState.SUSPECT,
+                Why.DRIFTING,
+                estimated=(drift,),
+                sigma=change.sigma,
+                unit='s/s',
+                evidence=evidence,
+            )
+        self._recursion.follow_offsets(offsets, first)
+        self.calibration = self._recursion.solved()
+        self._inconsistent, self.offset_change = [], None
+        self._likely, self._undetermined = np.zeros(LIVE.size), None
+        self._due = None
+
+    def _of_changes(self, stamp_ns: int) -> tuple[Finding, ...]:
+        """Findings on a drift, and on the last step for some seconds after its trial."""
+        found = () if self._drift is None else (self._drift,)
         if self._step is None or self.clock_steps.on_trial:
-            return ()
-        end_ns, found = self._step
-        return (found,) if stamp_ns < end_ns + posterior.WINDOW_NS else ()
+            return found
+        end_ns, step = self._step
+        return (*found, step) if stamp_ns < end_ns + posterior.WINDOW_NS else found
 
     def restart(self) -> None:
         """Forget the pairs so far, but not what agreement with the gyro is."""
@@ -216,7 +277,7 @@ class ConsistencyMonitor:
         self.clock_steps.end_doubt()
         self._inconsistent, self._gross = [], ()
         self._likely, self._undetermined = np.zeros(LIVE.size), None
-        self._due = self.latest = self._step = None
+        self._due = self.latest = self._step = self.offset_change = None
         self.calibration = posterior.NOTHING_ESTIMATED
 
     def _compare_directions(self, due: _Due) -> None:
@@ -231,16 +292,22 @@ class ConsistencyMonitor:
         return sum((one.deviation for one in self._inconsistent), np.zeros(LIVE.size))
 
 
-def _finding_of_step(step: ClockStep) -> Finding:
-    measured = {'before_ns': step.before_ns, 'after_ns': step.after_ns}
+def _finding_of_step(
+    seconds: float, sigma: float, between_ns: tuple[int, int], gain: float, pairs: int
+) -> Finding:
+    before_ns, after_ns = between_ns
     return Finding(
         Code.OFFSET_STEP,
         FindingState.SUSPECT,
         Why.STEPPED,
-        estimated=(step.seconds,),
-        sigma=step.sigma,
+        estimated=(seconds,),
+        sigma=sigma,
         unit='s',
-        evidence=Evidence(pairs=len(step.pairs), log_likelihood=step.gain, measured=measured),
+        evidence=Evidence(
+            pairs=pairs,
+            log_likelihood=gain,
+            measured={'before_ns': before_ns, 'after_ns': after_ns},
+        ),
     )
 
 
@@ -394,7 +461,10 @@ class Applied:
     readout_time: float = 0.0  # [s]
     # [s] beyond the configured rows that the IMU must cover, too, for a longer readout time.
     margin: float = 0.0
-    stepped: float = 0.0  # [s] sum of the steps of the time offset that were found
+    # [s] sum of the changes of the time offset that were found, and [s/s] its drift since a stamp.
+    stepped: float = 0.0
+    drift: float = 0.0
+    drift_ns: int = 0
 
     @property
     def offset(self) -> float:
@@ -404,6 +474,21 @@ class Applied:
     def after_step(self, seconds: float) -> Applied:
         """The corrections after a step of the time offset."""
         return replace(self, stepped=self.stepped + seconds)
+
+    def after_change(self, change: OffsetChange, stamp_ns: int) -> Applied:
+        """The corrections at a stamp after a small step, or with a drift."""
+        if change.kind is Kind.STEP:
+            return self.after_step(change.now)
+        since = 1e-9 * (stamp_ns - change.between_ns[1])
+        stepped = self.stepped + change.now + change.value * since
+        return replace(self, stepped=stepped, drift=self.drift + change.value, drift_ns=stamp_ns)
+
+    def at(self, stamp_ns: int) -> Applied:
+        """The corrections at a stamp: the drift goes on."""
+        if not self.drift:
+            return self
+        since = 1e-9 * (stamp_ns - self.drift_ns)
+        return replace(self, stepped=self.stepped + self.drift * since, drift_ns=stamp_ns)
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
         """One step towards the estimate, or back to zero if the parameter is not tracked."""
@@ -434,4 +519,9 @@ class Applied:
             ),
         )
         ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
-        return Applied(offset, readout, max(readout + ahead, 0.0), self.stepped)
+        return replace(
+            self,
+            time_offset=offset,
+            readout_time=readout,
+            margin=max(readout + ahead, 0.0),
+        )

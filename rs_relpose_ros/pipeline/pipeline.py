@@ -354,7 +354,7 @@ class Pipeline(Processor[PairResult]):
             if contradicts or monitor.clock_steps.in_doubt:
                 pose = withheld(pose, _STEP_SOUGHT)
         tracked = Tracked.of(monitor.calibration, configured)
-        self._correct(tracked, configured)
+        self._correct(frame.stamp_ns, tracked, configured)
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         latest = monitor.latest
         return replace(
@@ -366,16 +366,22 @@ class Pipeline(Processor[PairResult]):
             image2=frame.image if self._keep_images else None,
         )
 
-    def _correct(self, tracked: Tracked, configured: Configured) -> None:
+    def _correct(self, stamp_ns: int, tracked: Tracked, configured: Configured) -> None:
         """Move the corrections of the next frames towards the estimates, or by a step."""
         monitor = self._monitor
         steps = monitor.clock_steps
+        change = monitor.offset_change
+        self.applied = self.applied.at(stamp_ns)
         if (wrong := steps.refuted()) is not None:
             self.applied = self.applied.after_step(-wrong.seconds)
             monitor.restart()
         elif (step := steps.found()) is not None:
             self.applied = self.applied.after_step(step.seconds)
-            monitor.follow_step(step)
+            sensor = _with_step(configured.sensor, step.seconds)
+            monitor.follow_step(step, validate.replaced(configured, sensor=sensor))
+        elif change is not None and not steps.in_doubt:
+            self.applied = self.applied.after_change(change, stamp_ns)
+            monitor.follow_change(change, self.applied.drift)
         else:
             if not steps.in_doubt:
                 self.applied = self.applied.moved(tracked, configured.sensor)

@@ -57,6 +57,10 @@ MAX_IMU_WAIT_NS = NANOSECONDS
 # Delay [ns] behind the gyro above which frames do not wait for an accelerometer of its own topic:
 # one that has ended must not stop the frames. [chosen: ten periods of a slow accelerometer]
 _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
+# Change of the time offset from one frame to the next [ns] that is a step of a clock, after which
+# tracking restarts; a smaller one turns the gyro of one interval by less than its noise.
+# [chosen: half of the largest step of a tracked offset]
+_STEP_NS = NANOSECONDS // 2000
 # Most refusals that are kept until they are taken; the counters lose none.
 # [chosen: some seconds of frames]
 _REFUSALS_KEPT = 256
@@ -313,7 +317,7 @@ class Sequencer:
         """
         with self._changed:
             stepped_ns = to_nanoseconds(applied.stepped)
-            if stepped_ns != self._stepped_ns:
+            if abs(stepped_ns - self._stepped_ns) > _STEP_NS:
                 # The gyro since the frame before would be that of another time.
                 self._previous_ns = None
             self._stepped_ns = stepped_ns
