@@ -703,7 +703,7 @@ def test_halves_that_disagree_widen_the_sigmas():
     rates = gyro.rates.copy()
     rates[gyro.stamps_ns > recorded().tracks.stamps_ns[50]] += [0.03, 0.0, 0.0]
     final, _ = fitted(free_of(EXPOSURE), gyro=GyroSeries(gyro.stamps_ns, rates))
-    covariance = widened(final, None).covariance
+    covariance = widened(final).covariance
     # The bias is 0.015 rad/s from the mean in each half.
     assert np.sqrt(covariance[BIAS, BIAS]) > 5e-3
 
@@ -758,7 +758,7 @@ def test_what_the_data_determine_of_a_claim_is_no_doubt():
     wide = widened(final)
     left = wide.covariance - wide.by_doubt @ wide.by_doubt.T
     assert np.linalg.eigvalsh(left[final.block]).min() > -1e-12
-    more = widened(final, knowledge.TANGENTIAL_SIGMA)
+    more = widened(final, in_images=True)
     difference = more.covariance - wide.covariance
     assert np.linalg.eigvalsh(difference).min() > -1e-12 * np.trace(difference)
     assert difference[model.ROTATION, model.ROTATION].trace() > 0.0

@@ -185,7 +185,7 @@ def _calibrated(
         free |= knowledge.CLAIMED
     data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
     progress(0.7)
-    final = errors.widened(final, knowledge.TANGENTIAL_SIGMA if config.exposed else 0.0)
+    final = errors.widened(final, in_images=config.exposed)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
     curve = fit.cost_curve(
@@ -224,7 +224,7 @@ def warm_up_fit() -> None:
     begin = fit.initial(problem, np.eye(3), 0.0)
     some = OFFLINE.mask('axes', 'readout_time')
     found = errors.fit(fit.with_bends(problem, begin), begin, some, rounds=1)
-    errors.widened(found, knowledge.TANGENTIAL_SIGMA)
+    errors.widened(found, in_images=True)
 
 
 def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tuple[fit.Fit, bool]:
