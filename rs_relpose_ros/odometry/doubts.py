@@ -31,10 +31,10 @@ _ACCEL_LAG = 5e-3
 # are exact. Smaller ones exclude errors that pairs do not show within seconds, larger ones delay
 # starts. [measured: docs/lab/odometry.md, "Deviations that nobody stated"]
 _UNSTATED = {
-    'axes': 0.01,  # [rad]
-    'time_offset': 4e-3,  # [s]
-    'readout_time': 5e-4,  # [s]
-    'focal_log': 0.01,
+    'axes': 5e-3,  # [rad]
+    'time_offset': 3e-3,  # [s]
+    'readout_time': 3e-4,  # [s]
+    'focal_log': 5e-3,
     'principal_point': 5.0,  # [px]
 }
 
