@@ -5,6 +5,7 @@ import json
 import math
 
 from conftest import BUNDLED_PARAMETERS
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -186,6 +187,19 @@ def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys
     assert (np.diff(rows.loops_ns) > 1.9e9).all()
     assert all(0.0 < value < 3.0 for value in summary['nees'].values())
     assert summary['beyond'] == {'position': 0.0, 'rotation': 0.0, 'velocity': 0.0}
+
+
+def test_a_bag_without_a_solved_graph_is_an_error(bundled_bag, tmp_path, monkeypatch, capsys):
+    class Singular(gtsam.BatchFixedLagSmoother):
+        def update(self, *_):
+            raise RuntimeError('\nIndeterminant linear system\nwhile working near x5')
+
+    monkeypatch.setattr(gtsam, 'BatchFixedLagSmoother', Singular)
+    command = ['odometry', str(bundled_bag), '--params', str(BUNDLED_PARAMETERS)]
+    assert main([*command, '--out', str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert 'odometry did not start: the graph cannot be solved: Indeterminant' in printed
+    assert len((tmp_path / 'odometry.csv').read_text().splitlines()) == 1
 
 
 @pytest.mark.long
