@@ -147,6 +147,38 @@ def test_usual_recording_is_calibrated_from_nothing(tmp_path):
     np.testing.assert_allclose(sensor.R_cam_imu, result.R_cam_imu, atol=1e-6)
 
 
+@pytest.mark.parametrize('share', [0.01, 0.05])
+def test_matches_beyond_the_fold_of_a_lens_are_dropped(share):
+    """A wide lens has pixels that no ray reaches; trackers follow points there all the same."""
+    recorded, _ = usual()
+    lens = dataclasses.replace(camera_of(recorded.truth), distortion=(-0.25, 0.0, 0.0, 0.0, 0.0))
+    tracks = recorded.tracks
+    rays = camera_of(recorded.truth).unproject(tracks.points)
+    seen = np.hypot(rays[:, 0], rays[:, 1]) < rays[:, 2]  # before the fold at 1.15
+    number = round(share * seen.sum() / len(tracks))
+    frames = np.repeat(np.arange(len(tracks)), number)
+    ids = np.tile(np.arange(number, dtype=tracks.ids.dtype), len(tracks)) + tracks.ids.max() + 1
+    beyond = np.stack([6.0 + 0.05 * frames, 4.0 + 3.0 * np.tile(np.arange(number), len(tracks))])
+    assert number >= 1 and np.isnan(lens.unproject(beyond.T)).all()
+    order = np.argsort(np.concatenate([tracks.frames[seen], frames]), kind='stable')
+    both = TrackedPoints(
+        tracks.stamps_ns,
+        np.concatenate([tracks.frames[seen], frames])[order],
+        np.concatenate([tracks.ids[seen], ids])[order],
+        np.concatenate([lens.project(rays[seen]), beyond.T])[order],
+    )
+    inside = TrackedPoints(
+        tracks.stamps_ns, tracks.frames[seen], tracks.ids[seen], lens.project(rays[seen])
+    )
+    found, usual_one = (calibrate(one, recorded.gyro, lens) for one in (both, inside))
+    for name in ('readout_time', 'time_offset'):
+        estimate, expected = getattr(found, name), getattr(usual_one, name)
+        assert estimate.observable
+        assert abs(estimate.value - expected.value) < expected.sigma
+    turn = Rotation.from_matrix(found.R_cam_imu @ usual_one.R_cam_imu.T).magnitude()
+    assert turn < usual_one.rotation_sigma.max()
+
+
 def test_sigmas_are_of_the_size_of_the_errors():
     recorded, result = usual()
     truth = recorded.truth
