@@ -43,8 +43,8 @@ def read_euroc(folder: Path) -> Recording:
     table = root / 'cam0' / 'data.csv'
     if not table.is_file():
         raise MissingInputError(
-            f'{folder} is no EuRoC folder: {table} is missing; it must list the stamp and the file '
-            'of each image in cam0/data, and imu0/data.csv the samples of the IMU'
+            f'{folder} is no EuRoC folder: {table} is missing; it must list the stamp and the '
+            'file of each image in cam0/data, and imu0/data.csv the samples of the IMU'
         )
     rows = list(read_rows(table, range(2)))
     if not rows:
