@@ -1,11 +1,14 @@
 """Steps of a clock in the middle of a recording: found, named, and followed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_monitor import CONFIGURED
 
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.calibration.findings import Code, NOT_EVALUATED, worst_of
+from rs_relpose_ros.calibration.assessment import unexplained
+from rs_relpose_ros.calibration.findings import Code, FindingState, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import line
 from rs_relpose_ros.calibration.offset_changes import Kind, offset_change
 from rs_relpose_ros.calibration.posterior import Calibration
@@ -115,3 +118,16 @@ def test_a_drift_is_measured(rate):
 def test_a_constant_offset_is_no_change(offset, seed):
     pairs = calibration_of(np.full(PAIRS, offset), seed)
     assert offset_change(pairs, STAMPS_NS, CONFIGURED) is None
+
+
+@pytest.mark.parametrize(('noise', 'named'), [(1.0, False), (1.2, False), (2.0, True)])
+def test_pairs_that_contradict_each_other_are_named_without_a_cause(noise, named):
+    pairs = calibration_of(np.full(PAIRS, 0.001))
+    scattered = replace(pairs, b=noise * pairs.b)
+    found = unexplained(scattered)
+    assert (found is not None) == named
+    if found is not None:
+        assert found.state is FindingState.WRONG
+        assert 'candidates' in line(found)
+    few = replace(pairs, S=pairs.S[:19], b=2.0 * pairs.b[:19])
+    assert unexplained(few) is None

@@ -598,3 +598,53 @@ def _how_images_are_turned(rotations: RotationComparison) -> list[Why]:
         if float(axis_of.max()) > math.cos(_HALF_TURN):
             found.append(Why.UPSIDE_DOWN if axis_of[2] == axis_of.max() else Why.MIRRORED)
     return found
+
+
+# -- A test that presupposes no cause -------------------------------------------------------------
+#
+# Each pair has a score in the deviations of the configuration. At the deviations that fit all
+# pairs best, the scores that are left are those of noise, with the information of each pair as
+# their covariance. If they are larger, the pairs contradict each other, and no deviation is the
+# cause.
+
+# Median of the pairs' chi-square per degree of freedom from which no deviation explains them. Less
+# would doubt correct recordings, more would publish poses of a camera that stabilises its images.
+# [measured: 0.2 on simulated walks, 0.5 to 0.8 on recordings of a RealSense, up to 1.7 on those of
+# a phone; 2.3 to 4.2 with stabilisation, vibration, an object or stamps that jitter]
+_LARGEST_CHI_SQUARE = 2.2
+# Pairs that show it. Fewer would doubt pairs that are not yet linearised about a deviation that is
+# far off. [chosen: 2 to 4 s of keyframes]
+_FEWEST_PAIRS = 20
+# The same if a parameter is wrong by the pairs: at its estimate, the pairs would agree by then.
+# [chosen: 5 to 10 s of keyframes]
+_FEWEST_IF_NAMED = 50
+# What changes images or gyro from pair to pair, other than any deviation of the configuration.
+# [derived: codes of the findings whose texts say what to do]
+_CANDIDATES = (Code.IMAGE_GEOMETRY, Code.GYRO_NOISE, Code.TIME_OFFSET)
+
+
+def unexplained(estimated: Calibration, *, is_named: bool = False) -> Finding | None:
+    """The finding that pairs contradict each other without a known cause; None if they agree.
+
+    `is_named`: whether a parameter is wrong by these pairs, which may be linearised far from it.
+    """
+    count = len(estimated.b)
+    if count < (_FEWEST_IF_NAMED if is_named else _FEWEST_PAIRS):
+        return None
+    # Scaled by the prior: the deviations have different units.
+    information = estimated.S * np.outer(LIVE.sigmas, LIVE.sigmas)
+    scores = (estimated.b - estimated.S @ estimated.c) * LIVE.sigmas
+    with_prior = information + np.eye(LIVE.size)
+    whitened = np.linalg.solve(with_prior, np.dstack([scores, information]))
+    squares = (scores * whitened[:, :, 0]).sum(axis=1)
+    freedom = np.trace(whitened[:, :, 1:], axis1=1, axis2=2)
+    ratio = float(np.median(squares / freedom))
+    if ratio < _LARGEST_CHI_SQUARE:
+        return None
+    return Finding(
+        Code.UNKNOWN_CAUSE,
+        FindingState.WRONG,
+        Why.UNEXPLAINED,
+        evidence=Evidence(pairs=count, measured={'chi_square_per_freedom': ratio}),
+        candidates=_CANDIDATES,
+    )

@@ -62,6 +62,7 @@ class Code(str, Enum):
     STATIC_REGION = 'static_region'
     OFFSET_STEP = 'offset_step'
     OFFSET_DRIFT = 'offset_drift'
+    UNKNOWN_CAUSE = 'unknown_cause'
     # Causes that the odometry names.
     GYRO_NOISE = 'gyro_noise'
     ACCEL_NOISE = 'accel_noise'
@@ -112,6 +113,7 @@ class Why(str, Enum):
     STILL = 'still'  # images or parts of them, though the camera turns
     STEPPED = 'stepped'  # a clock was set while the sensors ran
     DRIFTING = 'drifting'  # a clock runs at another rate
+    UNEXPLAINED = 'unexplained'  # pairs contradict each other, whatever parameter is changed
     # Gross errors: `is_gross`.
     GROSS = 'gross'
     LEFT_HANDED = 'left_handed'
@@ -208,6 +210,11 @@ class Assessment:
         return any(finding.code is Code.STATIC_REGION for finding in self.findings)
 
     @property
+    def is_unexplained(self) -> bool:
+        """Whether no parameter explains the pairs, so that those found before do not either."""
+        return any(finding.code is Code.UNKNOWN_CAUSE for finding in self.findings)
+
+    @property
     def is_gross(self) -> bool:
         """Whether the worst finding is a gross error."""
         return self.state is FindingState.WRONG and self.faults[0].why.is_gross
@@ -220,10 +227,14 @@ NOT_EVALUATED = Assessment(())
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
     """The worse finding of each quantity, and of two equally bad ones the later.
 
-    If `now` has a gross error or masks a part of the image, and `before` did not, the earlier
-    findings were traces of it and are dropped.
+    If `now` has a gross error, masks a part of the image, or is unexplained, and `before` was not,
+    the earlier findings were traces of it and are dropped.
     """
-    traces = (now.is_gross and not before.is_gross) or (now.masks and not before.masks)
+    traces = (
+        (now.is_gross and not before.is_gross)
+        or (now.masks and not before.masks)
+        or (now.is_unexplained and not before.is_unexplained)
+    )
     found = {} if traces else {finding.code: finding for finding in before.findings}
     # A quantity that was observable once is not unknown any more.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)

@@ -319,6 +319,19 @@ def _offset_drift(finding: Finding) -> Text:
     )
 
 
+def _unknown_cause(finding: Finding) -> Text:
+    ratio = finding.evidence.measured['chi_square_per_freedom']
+    return Text(
+        f'pairs contradict each other, whatever parameter is changed (chi-square per degree of '
+        f'freedom {ratio:.1f}), and the cause is not known; candidates: stabilisation of lens or '
+        'images, vibration or noise of the gyro, an object that fills much of the view, jitter of '
+        'the stamps, filters of the IMU that lag',
+        'switch stabilisation off; put the running carrier at rest and compare the gyro with '
+        'gyro_noise_density; point the camera at a scene that does not move; stamp images at '
+        'their exposure',
+    )
+
+
 def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
@@ -344,6 +357,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.STATIC_REGION, Why.STILL): _static_region,
     (Code.OFFSET_STEP, Why.STEPPED): _offset_step,
     (Code.OFFSET_DRIFT, Why.DRIFTING): _offset_drift,
+    (Code.UNKNOWN_CAUSE, Why.UNEXPLAINED): _unknown_cause,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
     (Code.KNOCK, Why.OFF): _knock,

@@ -29,8 +29,13 @@ _DRIFT_SIGMA = 5e-4
 _CERTAIN = 25.0
 # Lead in chi-square over every other cause. [derived: 5 in the log-likelihood]
 _LEAD = 10.0
-# Pairs on either side of a border. Fewer would follow a single pair. [chosen: 3 to 6 would do]
-_ON_EACH_SIDE = 4
+# Pairs below which nothing is decided. [chosen: 2 to 4 s of keyframes]
+_FEWEST = 20
+# Pairs that come before a step. Fewer would take the first pairs, which are not linearised about
+# the deviations yet, for those before a step. [chosen: 1 to 2 s of keyframes]
+_BEFORE = 10
+# Pairs that follow a step. Fewer would follow a single pair. [chosen: 3 to 6 would do]
+_AFTER = 4
 # Shortest time [s] that shows a drift. [chosen: a step or a change of temperature takes less]
 _SHORTEST = 6.0
 # Place of the offset in the vector of deviations.
@@ -71,11 +76,11 @@ def offset_change(
 ) -> OffsetChange | None:
     """The change of the offset that explains N pairs (N,) best, if there is one."""
     count = len(estimated.b)
-    if count < 2 * _ON_EACH_SIDE:
+    if count < _FEWEST:
         return None
     constant, free, other = offset_hypotheses(estimated, configured)
     numbers = np.arange(count)
-    borders = np.arange(_ON_EACH_SIDE, count - _ON_EACH_SIDE + 1)
+    borders = np.arange(_BEFORE, count - _AFTER + 1)
     after = (numbers >= borders[:, None]).astype(float)
     seconds = (stamps_ns - stamps_ns[-1]) * 1e-9
     step, border = _best(constant, after, _STEP_SIGMA)

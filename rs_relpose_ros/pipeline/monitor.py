@@ -171,8 +171,11 @@ class ConsistencyMonitor:
                 self._inconsistent = assessment.find_inconsistencies(
                     self.calibration, self._on_poses or self._on_rotations, configured
                 )
-                self.offset_change = offset_change(
-                    self.calibration, self._recursion.stamps_ns, configured
+                # Pairs that contradict each other would show a change by chance.
+                self.offset_change = (
+                    None
+                    if assessment.unexplained(self.calibration)
+                    else offset_change(self.calibration, self._recursion.stamps_ns, configured)
                 )
                 self._likely = (
                     self._deviation()
@@ -190,6 +193,8 @@ class ConsistencyMonitor:
         )
         gross = self._gross or self._directions.findings(configured.camera)
         self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
+        if not gross:
+            self._test_without_cause()
         self._wrong_configuration = bool(self.health.faults)
         if self._wrong_configuration:
             self.acceleration.clear()
@@ -201,6 +206,17 @@ class ConsistencyMonitor:
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
+
+    def _test_without_cause(self) -> None:
+        """Report that the pairs contradict each other, in place of a cause that does not fit."""
+        try:
+            is_named = self.health.state is FindingState.WRONG
+            unknown = assessment.unexplained(self.calibration, is_named=is_named)
+        except np.linalg.LinAlgError:
+            return
+        if unknown is not None:
+            others = assessment.not_evaluated(set(), unknown.code)
+            self.health = Assessment((unknown, *others))
 
     def follow_step(self, step: ClockStep, configured: Configured) -> None:
         """Go on after a step of the time offset, with what the pairs after it say.
