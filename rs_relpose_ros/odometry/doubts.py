@@ -31,7 +31,7 @@ _ACCEL_LAG = 5e-3
 # are exact. Smaller ones exclude errors that pairs do not show within seconds, larger ones delay
 # starts. [measured: docs/lab/odometry.md, "Deviations that nobody stated"]
 _UNSTATED = {
-    'axes': 5e-3,  # [rad]
+    'axes': 4e-3,  # [rad]
     'time_offset': 3e-3,  # [s]
     'readout_time': 3e-4,  # [s]
     'focal_log': 5e-3,

@@ -52,10 +52,11 @@ _STILL_GATE = 4.0
 # to 2 cm/s each sigma is large, and no slow camera would start; without it wrong starts happened
 # in slow motion. [measured: docs/lab/odometry.md, "Starts", slow motion]
 _LEAST_SPEED = 0.1
-# Least variance of a pair by that of its images, after the start. A smaller one makes states too
-# certain, as errors of consecutive pairs persist; a larger one makes all states too uncertain.
+# Least variance of a pair by that of its images, after the start. A smaller one makes paths worse
+# and some states too certain, as errors of consecutive pairs persist; a larger one makes all
+# states too uncertain.
 # [measured: docs/lab/odometry.md, "Noise by innovations", least variance]
-_LEAST_VARIANCE = 0.7
+_LEAST_VARIANCE = 1.0
 # Largest share of the window that one interval takes. A longer bridge would push the states before
 # it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
 _LONGEST_STEP = 0.25
