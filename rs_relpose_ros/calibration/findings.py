@@ -4,6 +4,8 @@ A finding has codes and numbers; `findings_text` makes its text where it leaves 
 deviations of the quantities are values of the selection `LIVE` of `core.deviations`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -179,6 +181,11 @@ class Finding:
         return bool(self.estimated) or self.state is not FindingState.UNKNOWN
 
 
+# Causes that move other parameters before they are found. [derived: pairs across a change of the
+# offset, and pairs that no parameter explains, are no evidence of another parameter]
+_DISTURBING = frozenset({Code.OFFSET_STEP, Code.OFFSET_DRIFT, Code.UNKNOWN_CAUSE})
+
+
 @dataclass(frozen=True, slots=True)
 class Assessment:
     """All findings after a pair."""
@@ -209,10 +216,10 @@ class Assessment:
         """Whether a part of the image is masked, which spoiled what was found before."""
         return any(finding.code is Code.STATIC_REGION for finding in self.findings)
 
-    @property
-    def is_unexplained(self) -> bool:
-        """Whether no parameter explains the pairs, so that those found before do not either."""
-        return any(finding.code is Code.UNKNOWN_CAUSE for finding in self.findings)
+    def is_disturbed_since(self, before: Assessment) -> bool:
+        """Whether what was found before may be a trace of a finding that is new since then."""
+        causes = {one.code for one in self.findings} & _DISTURBING
+        return bool(causes - {one.code for one in before.findings})
 
     @property
     def is_gross(self) -> bool:
@@ -227,13 +234,13 @@ NOT_EVALUATED = Assessment(())
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
     """The worse finding of each quantity, and of two equally bad ones the later.
 
-    If `now` has a gross error, masks a part of the image, or is unexplained, and `before` was not,
-    the earlier findings were traces of it and are dropped.
+    If `now` has a gross error, masks a part of the image, or has a change of the offset or pairs
+    without an explanation, and `before` had not, earlier findings were its traces and are dropped.
     """
     traces = (
         (now.is_gross and not before.is_gross)
         or (now.masks and not before.masks)
-        or (now.is_unexplained and not before.is_unexplained)
+        or now.is_disturbed_since(before)
     )
     found = {} if traces else {finding.code: finding for finding in before.findings}
     # A quantity that was observable once is not unknown any more.
