@@ -490,13 +490,10 @@ def evaluated(
 
     slope = _slope(final, parameters, sigmas)
     jitters = data.stamps.varying is observations.Varying.JITTER
-    unsettled = '' if final.converged else 'the fit has not converged'
-    lens, against = None, ''
+    lens = None
     if data.knowledge is not LensKnowledge.CLAIMED:
         lens = _lens(data, parameters, covariance, wide, one_axis)
-    elif final.free[model.FOCAL]:
-        against = _against_claims(data, parameters, covariance)
-    notes = (unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying), against)
+    notes = _notes(data, final, parameters, covariance)
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         readout_axis=data.camera.readout_axis,
@@ -526,8 +523,19 @@ def evaluated(
         pairs=final.problem.pairs,
         matches=int(final.problem.begin[-1]),
         frame_interval=data.interval,
-        warnings=tuple(filter(None, notes)),
+        warnings=tuple(filter(None, (*notes, one_axis, beyond))),
     )
+
+
+def _notes(
+    data: Observations, final: fit.Fit, parameters: Array, covariance: Array
+) -> tuple[str, ...]:
+    """What a user has to know of a fit beside its values; empty texts where there is nothing."""
+    unsettled = '' if final.converged else 'the fit has not converged'
+    against = ''
+    if data.knowledge is LensKnowledge.CLAIMED and final.free[model.FOCAL]:
+        against = _against_claims(data, parameters, covariance)
+    return unsettled, _UNCLEAR.get(data.stamps.varying, ''), against
 
 
 def _slope(final: fit.Fit, parameters: Array, sigmas: Array) -> Estimate | None:

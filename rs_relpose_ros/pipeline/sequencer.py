@@ -334,28 +334,10 @@ class Sequencer:
                     return None
         if isinstance(head, FrameRefused):
             return head
-        image = head.image
-        taken_ns = self._now()
         try:
-            if self._colors:
-                values, encoding = image.pixels(self._levels)
-            else:
-                values, encoding = image.decoded(self._levels), 'mono8'
-            frame: Frame[Any] = Frame(
-                image.stamp_ns,
-                values,
-                image.frame_id,
-                head.intrinsics,
-                encoding=encoding,
-                encoded=image if self._colors else None,
-                exposure=head.exposure,
-                ahead=head.ahead,
-                imu_doubt=head.imu_doubt,
-                ready_ns=head.ready_ns or 0,
-                taken_ns=taken_ns,
-            )
+            frame = self._decoded(head)
         except InputError as error:
-            return self._refused(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+            return self._refused(head.image.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
@@ -385,6 +367,28 @@ class Sequencer:
             self._taken_generation = self._generation
             self._counts.frames_taken += 1
             return frame
+
+    def _decoded(self, head: QueuedFrame) -> Frame[Any]:
+        """The frame with its pixels, not yet with its IMU data; InputError without pixels."""
+        image = head.image
+        taken_ns = self._now()
+        if self._colors:
+            values, encoding = image.pixels(self._levels)
+        else:
+            values, encoding = image.decoded(self._levels), 'mono8'
+        return Frame(
+            image.stamp_ns,
+            values,
+            image.frame_id,
+            head.intrinsics,
+            encoding=encoding,
+            encoded=image if self._colors else None,
+            exposure=head.exposure,
+            ahead=head.ahead,
+            imu_doubt=head.imu_doubt,
+            ready_ns=head.ready_ns or 0,
+            taken_ns=taken_ns,
+        )
 
     def _waits(self, deadline_ns: int) -> bool:
         """Wait for a change of the queue, or until its head is too old; False at the deadline."""
