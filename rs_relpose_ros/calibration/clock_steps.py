@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.posterior import PairData
-from rs_relpose_ros.core.losses import cauchy_cost, cauchy_weight, robust_scale
+from rs_relpose_ros.core.losses import cauchy_weight, robust_scale
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.gyro import GyroPath
@@ -377,8 +377,15 @@ def _costs(rows: _Rows, stream: _Stream, offsets: Array, sigma: float) -> Array:
 
 
 def _cost(distances: Array, sigma: float) -> Array:
-    """Sum of the robust costs of distances (..., N) [rad]."""
-    return np.asarray(cauchy_cost((distances / (_SCALE * sigma)) ** 2)).sum(axis=-1)
+    """Sum of Cauchy's costs of distances (..., N) [rad]: each is minus the log of its weight."""
+    return np.asarray(-np.log(_weights(distances, sigma)).sum(axis=-1))
+
+
+def _weights(distances: Array, sigma: float) -> Array:
+    """Cauchy's weights of distances of any shape [rad]."""
+    squares = (distances / (_SCALE * sigma)) ** 2
+    # In one dimension, for which the kernel has been compiled.
+    return np.asarray(cauchy_weight(squares.ravel())).reshape(squares.shape)
 
 
 def _distances(rows: _Rows, stream: _Stream, offsets: Array, sigma: float) -> Array:
@@ -396,7 +403,7 @@ def _distances(rows: _Rows, stream: _Stream, offsets: Array, sigma: float) -> Ar
         squares = [(np.cross(axes[:, None], view) ** 2).sum(axis=2) for view in (first, second)]
         variance = np.maximum(squares[0] + squares[1], _LEAST_SINE)
         distances = off / np.sqrt(variance)
-        weights = cauchy_weight((distances / (_SCALE * sigma)) ** 2) / variance
+        weights = _weights(distances, sigma) / variance
     return np.asarray(distances)
 
 

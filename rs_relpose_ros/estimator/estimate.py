@@ -493,9 +493,9 @@ class Estimation:
         weights, sigma = noise_mixture(
             self.residuals, self.refined.inliers, self.config.pixel_sigma
         )
-        used = self.matches._replace(weights=weights, sigma=sigma)
+        matches = self.matches._replace(weights=weights, sigma=sigma)
         row_time = -self.problem.reference_row_time
-        return covariance.image_information(used, self.refined.state, self.priors, row_time)
+        return covariance.image_information(matches, self.refined.state, self.priors, row_time)
 
     def _evidence(
         self, images: covariance.ImageInformation | None

@@ -551,8 +551,8 @@ def gain_without_gyro(
 
 def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
-    turned = (R @ observations[:, VIEW_2 : VIEW_2 + 3].T).T
-    normals = np.cross(observations[:, VIEW_1 : VIEW_1 + 3], turned).T
+    rays = (R @ observations[:, VIEW_2 : VIEW_2 + 3].T).T
+    normals = np.cross(observations[:, VIEW_1 : VIEW_1 + 3], rays).T
     normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
     _, axes = np.linalg.eigh(normals @ normals.T)
     return np.ascontiguousarray(axes[:, 0])

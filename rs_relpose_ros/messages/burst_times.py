@@ -100,6 +100,9 @@ _OFF_THE_LINE = 0.75
 # Share of the bursts with which the line may start again. With more the arrivals have no line, and
 # four of them look even by chance. [chosen: 0.05 to 0.2 would do; a link loses fewer]
 _MOST_LINES = 0.1
+# Largest correlation of successive arrivals that is used: with more, the times are as uncertain as
+# one arrival. [chosen: 0.9 to 0.99 would do: 256 bursts are 13 independent ones then]
+_LARGEST_CORRELATION = 0.9
 # Two sigmas of the common error of all times are the duration of a burst. [derived: a driver that
 # stamps a burst with the time of its first sample, and not of its last, makes this error]
 _SIGMAS_OF_BURST = 2.0
@@ -117,6 +120,7 @@ class _EvenLine:
         self._mean_number = 0.0
         self._mean_ns = 0
         self._scatter_ns = 0.0
+        self._correlation = 0.0  # of the deviations of successive arrivals from the line
 
     @property
     def is_known(self) -> bool:
@@ -140,8 +144,10 @@ class _EvenLine:
         """What the times of the next samples are worth."""
         of_burst = (self._bursts.size - 1) * self._step_ns / _SIGMAS_OF_BURST
         common = math.hypot(of_burst, self._scatter_ns)
-        # Sigma of a line at its end: twice the one of its middle.
-        varying = 2.0 * self._scatter_ns / math.sqrt(len(self._numbers))
+        # Sigma of a line at its end: twice the one of its middle. Of N residuals with a
+        # correlation r from one to the next, N (1 - r) / (1 + r) are independent.
+        independent = len(self._numbers) * (1.0 - self._correlation) / (1.0 + self._correlation)
+        varying = 2.0 * self._scatter_ns / math.sqrt(independent)
         return StampDoubt(common / NANOSECONDS, varying / NANOSECONDS)
 
     @property
@@ -165,6 +171,7 @@ class _EvenLine:
         residuals = deviations - self._step_ns * from_mean
         freedom = len(residuals) - 2
         self._scatter_ns = math.sqrt(float(residuals @ residuals) / freedom)
+        self._correlation = _correlation(residuals)
         # A delay only makes an arrival later. The mean of exponential delays is their scatter.
         self._mean_ns = first_ns + round(mean_arrival - self._scatter_ns)
 
@@ -178,6 +185,14 @@ class _EvenLine:
             return True
         expected_ns = self.time_ns(number - 1 + self._bursts.size)
         return abs(arrival_ns - expected_ns) <= _OFF_THE_LINE * self._period_ns
+
+
+def _correlation(residuals: NDArray[np.float64]) -> float:
+    """Correlation of successive residuals (N,), within what can be an estimate."""
+    total = float(residuals @ residuals)
+    if not total:
+        return 0.0
+    return float(np.clip(residuals[:-1] @ residuals[1:] / total, 0.0, _LARGEST_CORRELATION))
 
 
 # -- Sample by sample -----------------------------------------------------------------------------

@@ -324,7 +324,7 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     matches = result.matches
     found = result.landmarks
     assert found is not None, 'only pairs with a pose have inliers to publish'
-    table = np.column_stack(
+    values = np.column_stack(
         [
             matches.points1,
             matches.points2,
@@ -335,9 +335,9 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
             found.pixels2,
         ]
     )[inliers]
-    records = np.empty(len(table), dtype=MATCH_DTYPE)
+    records = np.empty(len(values), dtype=MATCH_DTYPE)
     records['id'] = matches.track_ids[inliers]
-    for name, column in zip(_FLOATS, table.T, strict=True):
+    for name, column in zip(_FLOATS, values.T, strict=True):
         records[name] = column
     return records
 

@@ -143,14 +143,14 @@ class ConsistencyMonitor:
         # The inconsistency, and deviations that the pairs so far have not excluded.
         doubt = np.outer(shift, shift) + by_deviation @ self._undetermined @ by_deviation.T
         images = pose.images and pose.images.moved_by(information.images_by_deviation)
-        widened = replace(pose, covariance=pose.covariance + doubt, images=images)
+        assessed = replace(pose, covariance=pose.covariance + doubt, images=images)
         # The effect of an inconsistent parameter on the baseline is not known.
         return (
-            widened.without_baseline(
+            assessed.without_baseline(
                 'baseline not known: a configured parameter is inconsistent (see health)'
             )
             if shift.any() and pose
-            else widened
+            else assessed
         )
 
     def assess(self) -> None:
@@ -375,23 +375,23 @@ class Agreement:
         self._squares = self._freedom = 0.0
 
     def enlarged(
-        self, first_ns: int, second_ns: int, estimated: RelativePose, assessed: RelativePose
+        self, first_ns: int, second_ns: int, pose: RelativePose, assessed: RelativePose
     ) -> RelativePose:
-        """Add a pair as estimated; the assessed pose with its covariance enlarged."""
+        """Add a pair by its `pose`; the assessed pose with its covariance enlarged."""
         before, self._last = self._last, None
-        if not (estimated and np.isfinite(estimated.linear_velocity1_covariance).all()):
+        if not (pose and np.isfinite(pose.linear_velocity1_covariance).all()):
             return assessed
-        self._last = second_ns, estimated
+        self._last = second_ns, pose
         if before is not None and before[0] == first_ns:
             kept = 1.0 - 1.0 / _REMEMBERED
             self._squares = kept * self._squares + min(
-                2.0 * _LARGEST_DISAGREEMENT, _disagreement(before[1], estimated)
+                2.0 * _LARGEST_DISAGREEMENT, _disagreement(before[1], pose)
             )
             self._freedom = kept * self._freedom + 2.0
         prior = 2.0 * _PRIOR_PAIRS
         # The second factor: of a rotation that contradicts the gyro, as with two views.
         factor = max((prior + self._squares) / (prior + self._freedom), 1.0) * max(
-            (1.0 + estimated.diagnostics.gyro_square) / 4.0, 1.0
+            (1.0 + pose.diagnostics.gyro_square) / 4.0, 1.0
         )
         if factor == 1.0:
             return assessed
@@ -399,8 +399,8 @@ class Agreement:
         velocities[:3, :3] *= factor
         # Deviations that the monitor has not excluded would be in the disagreement, too: the
         # larger of both in each direction. Along t neither has a variance.
-        along = np.pad(np.outer(estimated.t, estimated.t), (0, 3))
-        root = np.linalg.cholesky(factor * estimated.covariance + along)
+        along = np.pad(np.outer(pose.t, pose.t), (0, 3))
+        root = np.linalg.cholesky(factor * pose.covariance + along)
         half = solve_triangular(root, assessed.covariance + along, lower=True)
         values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
         axes = root @ vectors

@@ -343,7 +343,9 @@ class Pipeline(Processor[PairResult]):
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
-        configured = self._configured(frame, since, sensor, parameters)
+        configured = self._configured(
+            frame.applied_offset_ns, frame.imu_doubt.common, since, sensor, parameters
+        )
         stamps_ns = history.stamp_ns, frame.stamp_ns
         contradicts = monitor.clock_steps.add(stamps_ns, since, data, pose)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
@@ -389,9 +391,17 @@ class Pipeline(Processor[PairResult]):
         self._rotation = None  # the gyro since then is that of another time
 
     def _configured(
-        self, frame: Frame[Any], since: ImuSlice, sensor: Sensor, parameters: Parameters
+        self,
+        applied_offset_ns: int,
+        offset_sigma: float,
+        since: ImuSlice,
+        sensor: Sensor,
+        parameters: Parameters,
     ) -> Configured:
-        """The parameters of a pair, and the deviations that are applied to it."""
+        """The parameters of a pair, and the deviations that are applied to it.
+
+        `offset_sigma` [s]: of the stamps of its gyro.
+        """
         bias = np.array(parameters.imu.gyro_bias)
         before_ns, stamp_ns = list(self._stamps_ns)[-2:]
         from_reference = (
@@ -401,12 +411,10 @@ class Pipeline(Processor[PairResult]):
             _with_step(parameters.sensor, self.applied.stepped),
             sensor.camera,
             bias,
-            configured_sigmas(
-                parameters, from_reference, sensor.camera.width, frame.imu_doubt.common
-            ),
+            configured_sigmas(parameters, from_reference, sensor.camera.width, offset_sigma),
             np.zeros(LIVE.size),
         )
-        configured.active[LIVE.index('time_offset')] = frame.applied_offset_ns / NANOSECONDS
+        configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
         configured.active[LIVE.index('readout_time')] = configured.direction * self._readout
         configured.active[LIVE.part('gyro_bias')] = (
             parameters.sensor.R_cam_imu.T @ since.bias - bias

@@ -334,10 +334,28 @@ class Sequencer:
                     return None
         if isinstance(head, FrameRefused):
             return head
+        image = head.image
+        taken_ns = self._now()
         try:
-            frame = self._decoded(head)
+            if self._colors:
+                values, encoding = image.pixels(self._levels)
+            else:
+                values, encoding = image.decoded(self._levels), 'mono8'
+            frame: Frame[Any] = Frame(
+                image.stamp_ns,
+                values,
+                image.frame_id,
+                head.intrinsics,
+                encoding=encoding,
+                encoded=image if self._colors else None,
+                exposure=head.exposure,
+                ahead=head.ahead,
+                imu_doubt=head.imu_doubt,
+                ready_ns=head.ready_ns or 0,
+                taken_ns=taken_ns,
+            )
         except InputError as error:
-            return self._refused(head.image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+            return self._refused(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
@@ -349,16 +367,13 @@ class Sequencer:
                     'stamps jumped while the frame was decoded: its gyro samples are lost',
                 )
             reference_ns = head.reference_ns + self._offset_ns
-            previous_ns = self._previous_ns
-            if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
-                previous_ns = None
             frame.applied_offset_ns = self._offset_ns - self._stepped_ns
             frame.imu_data = frame_imu(
                 self._buffer,
                 span_ns,
                 reference_ns,
                 self._R_cam_imu,
-                previous_ns,
+                self._previous_before(reference_ns),
                 head.exposure,
                 gyro_only=self.gyro_only,
             )
@@ -368,27 +383,12 @@ class Sequencer:
             self._counts.frames_taken += 1
             return frame
 
-    def _decoded(self, head: QueuedFrame) -> Frame[Any]:
-        """The frame with its pixels, not yet with its IMU data; InputError without pixels."""
-        image = head.image
-        taken_ns = self._now()
-        if self._colors:
-            values, encoding = image.pixels(self._levels)
-        else:
-            values, encoding = image.decoded(self._levels), 'mono8'
-        return Frame(
-            image.stamp_ns,
-            values,
-            image.frame_id,
-            head.intrinsics,
-            encoding=encoding,
-            encoded=image if self._colors else None,
-            exposure=head.exposure,
-            ahead=head.ahead,
-            imu_doubt=head.imu_doubt,
-            ready_ns=head.ready_ns or 0,
-            taken_ns=taken_ns,
-        )
+    def _previous_before(self, reference_ns: int) -> int | None:
+        """Reference time of the frame before, if it is near enough for a rotation between both."""
+        previous_ns = self._previous_ns
+        if previous_ns is None or reference_ns - previous_ns > self._longest_interval_ns:
+            return None
+        return previous_ns
 
     def _waits(self, deadline_ns: int) -> bool:
         """Wait for a change of the queue, or until its head is too old; False at the deadline."""
