@@ -115,16 +115,21 @@ def _best(solution: Solution, weights: Array, prior: float) -> tuple[_Change, in
     scores = b - S @ (solution.active + solution.off)
     mixed = weights @ columns
     moved = mixed @ solution.covariance  # change of the other deviations by the new one, negative
-    information = weights**2 @ columns[:, _OFFSET] - (moved * mixed).sum(axis=1) + prior**-2.0
+    by_others = (moved * mixed).sum(axis=1)
+    information = weights**2 @ columns[:, _OFFSET] - by_others + prior**-2.0
     gradients = weights @ scores[:, _OFFSET]
-    best = int(np.argmax(gradients**2 / information))
+    gains = gradients**2 / information
+    best = int(np.argmax(gains))
     value = float(gradients[best] / information[best])
     # Parts of the pairs in what is left of the gradient, the other deviations eliminated.
     weight, along = weights[best], moved[best]
-    left = scores - value * (weight[:, None] * columns - S @ along)
+    explained = weight[:, None] * columns - S @ along
+    left = scores - value * explained
     parts = value * (weight * left[:, _OFFSET] - left @ along)
+    scattered = max(float((parts**2).sum()), 1e-12)
     gain = value * float(gradients[best])
-    agreement = min(gain / max(float((parts**2).sum()), 1e-12), 1.0)
-    sigma = float(1.0 / np.sqrt(information[best] * max(agreement, 1e-6)))
+    agreement = min(gain / scattered, 1.0)
+    agreed = information[best] * max(agreement, 1e-6)
+    sigma = float(1.0 / np.sqrt(agreed))
     offset = float(solution.off[_OFFSET] - along[_OFFSET] * value)
     return _Change(value, sigma, gain, gain * agreement, offset), best

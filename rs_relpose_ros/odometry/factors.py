@@ -64,8 +64,9 @@ _IMU_ROWS = 15
 _OF_GYRO_1 = slice(IMU['B1'].start + 3, IMU['B1'].stop)
 # The same of the second keyframe.
 _OF_GYRO_2 = slice(IMU['B2'].start + 3, IMU['B2'].stop)
-# Columns of velocity and position of the second keyframe, the latter in the axes of its body.
+# Columns of the velocity of the second keyframe.
 _OF_VELOCITY_2 = IMU['V2']
+# Columns of its position, in the axes of its body.
 _OF_PLACE_2 = slice(IMU['X2'].start + 3, IMU['X2'].stop)
 
 
