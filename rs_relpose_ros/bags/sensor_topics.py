@@ -114,8 +114,8 @@ class TopicFinder:
                 'CameraInfo',
                 CAMERA_INFO,
                 preferred=image.camera_info if image else '',
-                fix='; give camera_matrix, which "rs_relpose calibrate" estimates from a recording '
-                'in which the camera rotates about all three axes',
+                fix='; give camera_matrix, which "rs_relpose calibrate" estimates from a '
+                'recording in which the camera rotates about all three axes',
             )
         return Chosen(image, camera_info, imu, accel)
 
