@@ -177,6 +177,7 @@ def test_legal_arrays_are_copied(values):
         np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, rtol=1e-15)
 
 
+@pytest.mark.timeout(600)  # the kernels of all solvers are compiled by its first examples
 @settings(max_examples=80)
 @given(
     seeds,

@@ -14,7 +14,6 @@ from rs_relpose_ros.calibration.offset_changes import Kind, offset_change
 from rs_relpose_ros.calibration.posterior import Calibration
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.core.deviations import LIVE
-from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import Role
 from rs_relpose_ros.offline.replay import Replay
 
@@ -66,7 +65,7 @@ def test_a_clock_that_steps_is_named_and_followed(
     assert applied
     for pair in pairs:
         if measured['before_ns'] < pair.stamp_ns <= applied[0].stamp_ns:
-            assert pair.pose.status in (Status.WITHHELD, Status.NO_CONSENSUS)
+            assert not pair.pose
     assert sum(bool(pair.pose) for pair in applied[1:]) >= 4
     assert applied[-1].applied.offset == pytest.approx(step, abs=1e-3)
 

@@ -481,20 +481,25 @@ class Applied:
     stepped: float = 0.0
     drift: float = 0.0
     drift_ns: int = 0
+    stepped_variance: float = 0.0  # [s^2] of that sum
 
     @property
     def offset(self) -> float:
         """All of the time offset beyond the parameter [s]."""
         return self.stepped + self.time_offset
 
-    def after_step(self, seconds: float) -> Applied:
-        """The corrections after a step of the time offset."""
-        return replace(self, stepped=self.stepped + seconds)
+    def after_step(self, seconds: float, variance: float) -> Applied:
+        """The corrections after a step of the time offset; both are negative to take one back."""
+        return replace(
+            self,
+            stepped=self.stepped + seconds,
+            stepped_variance=max(self.stepped_variance + variance, 0.0),
+        )
 
     def after_change(self, change: OffsetChange, stamp_ns: int) -> Applied:
         """The corrections at a stamp after a small step, or with a drift."""
         if change.kind is Kind.STEP:
-            return self.after_step(change.now)
+            return self.after_step(change.now, change.sigma**2)
         since = 1e-9 * (stamp_ns - change.between_ns[1])
         stepped = self.stepped + change.now + change.value * since
         return replace(self, stepped=stepped, drift=self.drift + change.value, drift_ns=stamp_ns)

@@ -375,10 +375,10 @@ class Pipeline(Processor[PairResult]):
         change = monitor.offset_change
         self.applied = self.applied.at(stamp_ns)
         if (wrong := steps.refuted()) is not None:
-            self.applied = self.applied.after_step(-wrong.seconds)
+            self.applied = self.applied.after_step(-wrong.seconds, -(wrong.sigma**2))
             monitor.restart()
         elif (step := steps.found()) is not None:
-            self.applied = self.applied.after_step(step.seconds)
+            self.applied = self.applied.after_step(step.seconds, step.sigma**2)
             sensor = _with_step(configured.sensor, step.seconds)
             monitor.follow_step(step, validate.replaced(configured, sensor=sensor))
         elif change is not None and not steps.in_doubt:
@@ -407,6 +407,7 @@ class Pipeline(Processor[PairResult]):
         from_reference = (
             seconds_between(before_ns, stamp_ns) - parameters.sensor.time_offset_reference_interval
         )
+        offset_sigma = math.hypot(offset_sigma, math.sqrt(self.applied.stepped_variance))
         configured = Configured(
             _with_step(parameters.sensor, self.applied.stepped),
             sensor.camera,
