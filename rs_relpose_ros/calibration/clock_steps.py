@@ -134,6 +134,7 @@ class ClockSteps:
         self._sigmas: deque[float] = deque(maxlen=_USUAL_PAIRS)  # [rad] of their distances
         self._latest: PairData | None = None  # the last consistent pair, until its gyro is known
         self._doubtful: list[DoubtfulPair] = []  # since the first that contradicts the gyro
+        self._is_unsettled = False  # whether they have been in doubt, and none has settled it
         self._curves: dict[int, Array] = {}  # cost (M,) of a pair at all offsets, by its stamp
         self._last: ClockStep | None = None
         self._since_last = 0  # pairs since then
@@ -189,7 +190,11 @@ class ClockSteps:
         data: PairData | None,
         pose: RelativePose,
     ) -> bool:
-        """Add a pair with the stamps of its images; whether its images contradict the gyro."""
+        """Add a pair with the stamps of its images; whether its pose is in doubt.
+
+        Its images contradict the gyro, or those of pairs before did. A pair that ends a doubt is
+        still part of it: the camera may have been at rest meanwhile.
+        """
         self._keep(since)
         self._since_last += 1
         contradicts = data is not None and self.contradicts(pose)
@@ -199,17 +204,20 @@ class ClockSteps:
             self._add_consistent(data, pose)
             return False
         self._latest = None
+        was_in_doubt = self._is_unsettled
         self._doubtful.append(DoubtfulPair(*stamps_ns, data, _Rows.of(data), contradicts))
         del self._doubtful[:-_MOST_DOUBTFUL]
         last = self._doubtful[-_ENDS:]
         if len(last) == _ENDS and not any(pair.contradicts for pair in last):
             self.end_doubt()
-        return contradicts
+        self._is_unsettled |= self.in_doubt
+        return contradicts or was_in_doubt or self._is_unsettled
 
     def end_doubt(self) -> None:
         """Forget the pairs that contradict the gyro."""
         self._doubtful.clear()
         self._curves.clear()
+        self._is_unsettled = False
 
     def found(self) -> ClockStep | None:
         """The step of the time offset that explains the pairs of the doubt, if there is one."""

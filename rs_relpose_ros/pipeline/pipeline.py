@@ -347,13 +347,13 @@ class Pipeline(Processor[PairResult]):
             frame.applied_offset_ns, frame.imu_doubt.common, since, sensor, parameters
         )
         stamps_ns = history.stamp_ns, frame.stamp_ns
-        contradicts = monitor.clock_steps.add(stamps_ns, since, data, pose)
+        doubtful = monitor.clock_steps.add(stamps_ns, since, data, pose)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
         if parameters.pair.withhold_when_wrong:
             pose = suppressed(pose, monitor.health)
-            if contradicts or monitor.clock_steps.in_doubt:
+            if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
         tracked = Tracked.of(monitor.calibration, configured)
         self._correct(frame.stamp_ns, tracked, configured)
