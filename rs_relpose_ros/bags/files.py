@@ -21,6 +21,7 @@ from rs_relpose_ros.bags.ros1 import Ros1Storage
 from rs_relpose_ros.bags.sqlite import SqliteStorage
 from rs_relpose_ros.bags.storage import (
     DamagedError,
+    NoBeginError,
     Source,
     Storage,
     UnfinishedError,
@@ -107,6 +108,8 @@ def _damage(path: Path, file: Path, error: Exception) -> InputError:
         '.bag': f'copy it again, or "rosbag reindex {file.name}" in ROS 1',
     }
     remedy = remedies.get(file.suffix, 'copy it again')
+    if isinstance(error, NoBeginError):
+        remedy = 'copy it again, as no tool recovers a bag without its begin'
     return InputError(f'{path} {kind}: {reason}; {remedy}')
 
 
@@ -251,7 +254,7 @@ def _open(file: Path, path: Path, stack: ExitStack) -> Storage:
         return SqliteStorage(file, stack)
     if source is Source.ROS1:
         return Ros1Storage(file, stack)
-    raise DamagedError('it begins as no bag does')
+    raise NoBeginError('it begins as no bag does')
 
 
 def _source(file: Path, path: Path) -> Source | None:

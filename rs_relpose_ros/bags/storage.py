@@ -58,6 +58,10 @@ class DamagedError(InputError):
     """A file is not as its format requires; the text says how, without the name of the file."""
 
 
+class NoBeginError(DamagedError):
+    """A file begins as none of a bag does: no tool recovers it."""
+
+
 class UnfinishedError(DamagedError):
     """A recorder has not finished the file; the text has the remedy."""
 

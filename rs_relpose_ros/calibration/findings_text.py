@@ -26,7 +26,7 @@ from rs_relpose_ros.calibration.findings import (
     Why,
 )
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import clocks_apart
+from rs_relpose_ros.geometry.timing import clocks_apart, NANOSECONDS
 from rs_relpose_ros.imu.buffer import ForceFault
 
 # Longest text [characters] that is read as findings of a message: those of all causes at once
@@ -299,7 +299,7 @@ def _static_region(finding: Finding) -> Text:
 def _offset_step(finding: Finding) -> Text:
     step = with_sigma(Code.TIME_OFFSET, finding.estimated, finding.sigma or 0.0)
     measured = finding.evidence.measured
-    before, after = measured['before_ns'] * 1e-9, measured['after_ns'] * 1e-9
+    before, after = (measured[name] / NANOSECONDS for name in ('before_ns', 'after_ns'))
     return Text(
         f'the time offset between camera and IMU stepped by {step} between the images stamped '
         f'{before:.3f} and {after:.3f} s: the poses of this time are withheld, later ones have '

@@ -17,7 +17,7 @@ from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import Calibration
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.timing import Stamps
+from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps
 
 # 1 sigma of a step [s] before anything is measured. [derived: that of the offset]
 _STEP_SIGMA = float(LIVE.sigmas[LIVE.index('time_offset')])
@@ -82,7 +82,7 @@ def offset_change(
     numbers = np.arange(count)
     borders = np.arange(_BEFORE, count - _AFTER + 1)
     after = (numbers >= borders[:, None]).astype(float)
-    seconds = (stamps_ns - stamps_ns[-1]) * 1e-9
+    seconds = (stamps_ns - stamps_ns[-1]) / NANOSECONDS
     step, border = _best(constant, after, _STEP_SIGMA)
     also_off, _ = _best(free, after, _STEP_SIGMA)
     drift, _ = _best(free, seconds[None], _DRIFT_SIGMA)

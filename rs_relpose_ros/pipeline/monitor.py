@@ -33,6 +33,7 @@ from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 
 # Number of frames by whose arrival the clocks are compared. Fewer would take a burst of the
 # transport for another clock; more would notice it later. [chosen: under a second at 30 Hz]
@@ -255,7 +256,7 @@ class ConsistencyMonitor:
             )
             self._step = end_ns, found
         else:
-            offsets += 1e-9 * change.value * (stamps_ns - end_ns)
+            offsets += change.value * (stamps_ns - end_ns) / NANOSECONDS
             evidence = Evidence(
                 pairs=change.pairs,
                 log_likelihood=change.gain,
@@ -500,7 +501,7 @@ class Applied:
         """The corrections at a stamp after a small step, or with a drift."""
         if change.kind is Kind.STEP:
             return self.after_step(change.now, change.sigma**2)
-        since = 1e-9 * (stamp_ns - change.between_ns[1])
+        since = seconds_between(change.between_ns[1], stamp_ns)
         stepped = self.stepped + change.now + change.value * since
         return replace(self, stepped=stepped, drift=self.drift + change.value, drift_ns=stamp_ns)
 
@@ -508,7 +509,7 @@ class Applied:
         """The corrections at a stamp: the drift goes on."""
         if not self.drift:
             return self
-        since = 1e-9 * (stamp_ns - self.drift_ns)
+        since = seconds_between(self.drift_ns, stamp_ns)
         return replace(self, stepped=self.stepped + self.drift * since, drift_ns=stamp_ns)
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
