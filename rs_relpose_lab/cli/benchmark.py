@@ -486,11 +486,13 @@ def _run_carried_over(args: argparse.Namespace) -> int:
 )
 def _run_field(args: argparse.Namespace) -> int:
     from rs_relpose_lab.field.cases import BY_NAME
-    from rs_relpose_lab.field.run import report, run_case, Task
+    from rs_relpose_lab.field.run import prepare_bases, report, run_case, Task
 
     chosen = matching_cells(args.only, BY_NAME)
     args.output.mkdir(parents=True, exist_ok=True)
-    tasks = [Task(BY_NAME[name], args.output) for name in chosen]
+    tasks = [Task(name, args.output) for name in chosen]
+    if args.jobs > 1:
+        prepare_bases(tasks)
     return _report_of(tasks, run_case, report, args, 'case')
 
 

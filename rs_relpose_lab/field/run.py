@@ -9,21 +9,33 @@ import time
 from typing import NamedTuple
 
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
-from rs_relpose_lab.field.cases import BASES, Case
+from rs_relpose_lab.field.cases import BASES, BY_NAME, Case
 from rs_relpose_lab.field.recording import base_recording, write_recording
 from rs_relpose_lab.field.verdict import answers, judge, pose_distances, run_command, Verdict
 
 
 class Task(NamedTuple):
-    """A case and the folder of all cases."""
+    """The name of a case, which processes can send each other, and the folder of all cases."""
 
-    case: Case
+    name: str
     output: Path
+
+
+def prepare_bases(tasks: Sequence[Task]) -> None:
+    """Render the base recordings, and replay those that poses are counted against, each once.
+
+    Processes that work on cases of one base would write its files at the same time.
+    """
+    for task in tasks:
+        case = BY_NAME[task.name]
+        base_recording(BASES[case.base], task.output / 'bases' / case.base)
+        if case.solvable:
+            _undisturbed_poses(case, task.output)
 
 
 def run_case(task: Task) -> Verdict:
     """Make the recording of a case, run the commands on it, and judge their answers."""
-    case, output = task
+    case, output = BY_NAME[task.name], task.output
     base = base_recording(BASES[case.base], output / 'bases' / case.base)
     recording = case.change(base)
     folder = (output / 'cases' / case.name).resolve()
