@@ -1,6 +1,6 @@
 """Recursive calibration from frame pairs, the unknowns of each pair eliminated.
 
-Names are those of the equations in docs/health.md, "Recursive calibration". The deviations c (K,)
+Names are those of the equations in docs/monitor.md, "Recursive calibration". The deviations c (K,)
 are values of the selection `LIVE` of `core.deviations`.
 """
 

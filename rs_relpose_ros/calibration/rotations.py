@@ -1,6 +1,6 @@
 """Rotation by images alone against the gyro, and accelerometer against images.
 
-Method: docs/health.md, "Gross errors" and "Accelerometer". No prior and no pose is used, so that
+Method: docs/monitor.md, "Gross errors" and "Accelerometer". No prior and no pose is used, so that
 the comparison of rotations holds for any error of axes, unit or sign of the gyro.
 """
 
@@ -162,7 +162,7 @@ def _left(trace: float, theta: Array, phi: Array) -> float:
 # would report wrong axes later. [chosen: a third of `_CERTAIN`, so that four pairs have to agree]
 _LARGEST = 3.0
 # Logarithm of a Bayes factor that is certain, errors of neighbours being alike. Less would report
-# a right accelerometer. [measured: docs/health.md, "Accelerometer": 6 to 73 with right axes, -87
+# a right accelerometer. [measured: docs/monitor.md, "Accelerometer": 6 to 73 with right axes, -87
 # to -5 with wrong ones]
 _CERTAIN = 10.0
 # Time after which samples that are no specific force are reported. Less would report a step of a
