@@ -39,7 +39,7 @@ from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Reason, Silence, Statist
 from rs_relpose_ros.nodes.executor import KeptWaitSet
 from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
-from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.pair import Learned, PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
 SECOND = 10**9
@@ -395,16 +395,18 @@ def test_every_counter_has_its_own_field(clock, statistics):
     last = replace(
         pair(Status.LOW_PARALLAX, 'at rest'),
         health=Assessment((CONSISTENT,)),
-        tracked=Tracked(
-            gyro_bias=np.array([0.01, -0.02, 0.03]),
-            gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
-            time_offset=0.004,
-            time_offset_sigma=0.0005,
-            readout_time=0.031,
-            readout_time_sigma=0.0007,
-            pairs=7,
+        lesson=lambda: Learned(
+            tracked=Tracked(
+                gyro_bias=np.array([0.01, -0.02, 0.03]),
+                gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
+                time_offset=0.004,
+                time_offset_sigma=0.0005,
+                readout_time=0.031,
+                readout_time_sigma=0.0007,
+                pairs=7,
+            ),
+            applied=Applied(-0.0015, 0.0008),
         ),
-        applied=Applied(-0.0015, 0.0008),
     )
     clock.now = SECOND
     for result in (pair(), pair(), last):

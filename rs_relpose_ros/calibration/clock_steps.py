@@ -133,6 +133,7 @@ class ClockSteps:
         self._chi_squares: deque[float] = deque(maxlen=_USUAL_PAIRS)  # of consistent pairs
         self._sigmas: deque[float] = deque(maxlen=_USUAL_PAIRS)  # [rad] of their distances
         self._latest: PairData | None = None  # the last consistent pair, until its gyro is known
+        self._unmeasured: PairData | None = None  # the one before, whose gyro is known
         self._doubtful: list[DoubtfulPair] = []  # since the first that contradicts the gyro
         self._is_unsettled = False  # whether they have been in doubt, and none has settled it
         self._curves: dict[int, Array] = {}  # cost (M,) of a pair at all offsets, by its stamp
@@ -277,11 +278,18 @@ class ClockSteps:
             gyro.popleft()
 
     def _add_consistent(self, data: PairData, pose: RelativePose) -> None:
-        """Note how well a consistent pair fits; its last rows need the gyro of the next pair."""
+        """Note how well a consistent pair agrees with the gyro; `measure` follows."""
         if not math.isfinite(pose.diagnostics.gyro_square):
             return
-        before, self._latest = self._latest, data
+        self._unmeasured, self._latest = self._latest, data
         self._chi_squares.append(pose.diagnostics.gyro_square)
+
+    def measure(self) -> None:
+        """Note how well the consistent pair before the last one fits.
+
+        Its last rows need the gyro of the last pair. No pose depends on it before the next pair.
+        """
+        before, self._unmeasured = self._unmeasured, None
         if before is None or len(self._gyro) < 2:
             return
         both = self._gyro[-2].joined(self._gyro[-1])

@@ -157,7 +157,8 @@ def _image_value(
     """Part of the images' estimate; none if it is not known."""
 
     def part(pair: PairResult) -> Array | None:
-        value = None if pair.pose.images is None else of(pair.pose.images)
+        images = pair.images
+        value = None if images is None else of(images)
         numbers = np.atleast_1d(np.nan if value is None else value)
         return numbers if np.isfinite(numbers).all() else None
 

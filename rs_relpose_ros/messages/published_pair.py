@@ -114,9 +114,7 @@ class PublishedPair:
         fields = {value.field: value.of(pair) for value in PAIR_VALUES.values() if value.field}
         if fields['gyro_bias'] is None:
             fields['gyro_bias'] = np.full(3, math.nan)
-        return cls(
-            stamp_ns=pair.stamp_ns, frame_id=pair.frame_id, images=pair.pose.images, **fields
-        )
+        return cls(stamp_ns=pair.stamp_ns, frame_id=pair.frame_id, images=pair.images, **fields)
 
     def __bool__(self) -> bool:
         """Whether there is a pose."""

@@ -211,6 +211,7 @@ class Unroller(Processor[GlobalShutterFrame]):
                 ),
                 parameters,
             )
+            follower.prepare()
             self.applied = follower.applied
 
     def reset(self) -> None:

@@ -62,13 +62,14 @@ class _Due(NamedTuple):
     data: posterior.PairData | None
     pose: RelativePose
     configured: Configured
+    is_learned: bool = False
     information: posterior.PairInformation | None = None
 
 
 class ConsistencyMonitor:
     """Compares the configuration with frames and pairs in the order of time.
 
-    Each pair is added before its pose is published, and assessed after it.
+    Each pair is added before its pose is published; `learn` and `assess` follow the publication.
     """
 
     def __init__(self) -> None:
@@ -109,42 +110,24 @@ class ConsistencyMonitor:
         pose: RelativePose,
         configured: Configured,
     ) -> RelativePose:
-        """Add a pair; the pose with a covariance consistent with all pairs so far.
+        """Add a pair; the pose with a covariance consistent with the pairs before it.
 
-        `data` is None if the pair has no rotation or no gyro. `assess` completes it.
+        `data` is None if the pair has no rotation or no gyro. `learn` and `assess` complete it.
         """
         self.latest, self._due = None, _Due(stamp_ns, data, pose, configured)
         if data is None:
             return pose
-        try:
-            # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
-            # off already, a little more or less may hardly move them.
-            self.latest = information = self._recursion.add(
-                stamp_ns,
-                data,
-                configured.active,
-                np.asarray(configured.active + np.clip(self._likely, -LIVE.largest, LIVE.largest)),
-            )
-            if information is None:
+        by_deviation = pose.by_deviation
+        if by_deviation is None or self._undetermined is None:
+            # Two views, or the first pair: the covariance needs what the pair itself tells.
+            information = self.learn()
+            if information is None or self._undetermined is None:
                 return pose
-            self.calibration = self._recursion.solved()
-            if pose.by_deviation is not None:
-                # The published pose is the one of all frames, which depends less on deviations.
-                information = replace(information, pose_by_deviation=pose.by_deviation)
-                self.latest = information
-            self._due = self._due._replace(information=information)
             by_deviation = information.pose_by_deviation
-            shift = by_deviation @ self._deviation()
-            if self._undetermined is None:
-                self._undetermined = assessment.undetermined(self.calibration, configured)
-        except np.linalg.LinAlgError:
-            # A pair without rank has no information on the calibration; its pose is kept.
-            self._inconsistent = []
-            return pose
-        # The inconsistency, and deviations that the pairs so far have not excluded.
+        shift = by_deviation @ self._deviation()
+        # The inconsistency, and deviations that the pairs before have not excluded.
         doubt = np.outer(shift, shift) + by_deviation @ self._undetermined @ by_deviation.T
-        images = pose.images and pose.images.moved_by(information.images_by_deviation)
-        assessed = replace(pose, covariance=pose.covariance + doubt, images=images)
+        assessed = replace(pose, covariance=pose.covariance + doubt)
         # The effect of an inconsistent parameter on the baseline is not known.
         return (
             assessed.without_baseline(
@@ -154,8 +137,41 @@ class ConsistencyMonitor:
             else assessed
         )
 
+    def learn(self) -> posterior.PairInformation | None:
+        """Estimate the calibration from the last pair as well: its pose does not wait for it.
+
+        Returns what the pair tells; None if it tells nothing.
+        """
+        if self._due is None or self._due.data is None or self._due.is_learned:
+            return self.latest
+        self._due = self._due._replace(is_learned=True)
+        stamp_ns, data, pose, configured = self._due[:4]
+        assert data is not None
+        self.clock_steps.measure()
+        try:
+            # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
+            # off already, a little more or less may hardly move them.
+            likely = np.clip(self._likely, -LIVE.largest, LIVE.largest)
+            about = np.asarray(configured.active + likely)
+            information = self._recursion.add(stamp_ns, data, configured.active, about)
+            if information is None:
+                return None
+            if pose.by_deviation is not None:
+                # The published pose is the one of all frames, which depends less on deviations.
+                information = replace(information, pose_by_deviation=pose.by_deviation)
+            self.latest = information
+            self.calibration = self._recursion.solved()
+            self._due = self._due._replace(information=information)
+            if self._undetermined is None:
+                self._undetermined = assessment.undetermined(self.calibration, configured)
+        except np.linalg.LinAlgError:
+            # A pair without rank has no information on the calibration; its pose is kept.
+            self._inconsistent = []
+        return self.latest
+
     def assess(self) -> None:
         """Assess all quantities after the last pair, for the next one: its pose does not wait."""
+        self.learn()
         if self._due is None:
             return
         due, self._due = self._due, None

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 import math
+import threading
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry import Array, validate
@@ -127,6 +129,36 @@ def is_keyframe(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """What a pair tells of the configuration; its pose is published before."""
+
+    # (11, 9) change of the estimate by the images alone, by deviations of the images
+    images_by_deviation: Array | None = None
+    # (3,) [rad] rotation by the images alone against the gyro's; None without either
+    images_against_gyro: Array | None = None
+    # Tracked calibration, and the corrections that follow from it, after this pair.
+    tracked: Tracked | None = None
+    applied: Applied = field(default_factory=Applied)
+
+
+class Lesson:
+    """Makes what a pair has `Learned`, once: as soon as it is wanted, by any thread."""
+
+    def __init__(self, learn: Callable[[], Learned]) -> None:
+        self._learn: Callable[[], Learned] | None = learn
+        self._learned = Learned()
+        self._lock = threading.Lock()
+
+    def __call__(self) -> Learned:
+        """Learn, unless it was done before."""
+        with self._lock:
+            if self._learn is not None:
+                learn, self._learn = self._learn, None
+                self._learned = learn()
+        return self._learned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PairResult:
     """Estimate of one keyframe pair with its matches."""
 
@@ -144,12 +176,9 @@ class PairResult:
     parallax: float  # [px] median after derotation
     landmarks_of: Callable[[], Landmarks] | None = None  # None without a pose
     gyro_rotation: Array | None = None  # (3, 3) R_1^T R_2 integrated from the gyro
-    # (3,) [rad] rotation by the images alone against the gyro's; None without either
-    images_against_gyro: Array | None = None
     health: Assessment = NOT_EVALUATED  # by the pairs before: published before its assessment
-    # Tracked calibration, and the corrections that follow from it, after this pair.
-    tracked: Tracked | None = None
-    applied: Applied = field(default_factory=Applied)
+    # What it tells of the configuration: made after its pose has been published.
+    lesson: Callable[[], Learned] = Learned
     gyro_bias: Array | None = None  # (3,) [rad/s] that was removed, IMU frame
     image2: NDArray[np.uint8] | None = None  # only if the front end keeps images
     readout_axis: int = 1  # pixel coordinate that is the row: 1 (v), or 0 (u) for turned images
@@ -165,11 +194,33 @@ class PairResult:
         return int(np.count_nonzero(self.pose.inliers))
 
     @property
+    def images(self) -> ImageInformation | None:
+        """Estimate of the images alone, with the effect of deviations; None if there is none."""
+        by_deviation = self.lesson().images_by_deviation
+        if self.pose.images is None or by_deviation is None:
+            return self.pose.images
+        return self.pose.images.moved_by(by_deviation)
+
+    @property
+    def images_against_gyro(self) -> Array | None:
+        """Rotation (3,) [rad] by the images alone against the gyro's; None without either."""
+        return self.lesson().images_against_gyro
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Tracked calibration after this pair."""
+        return self.lesson().tracked
+
+    @property
+    def applied(self) -> Applied:
+        """Corrections of the next frames, which follow from the tracked calibration."""
+        return self.lesson().applied
+
+    @property
     def gyro_difference(self) -> float:
         """Angle between the rotations by gyro and by images alone [deg]; NaN without either."""
-        if self.images_against_gyro is None:
-            return math.nan
-        return math.degrees(float(np.linalg.norm(self.images_against_gyro)))
+        apart = self.images_against_gyro
+        return math.nan if apart is None else math.degrees(float(np.linalg.norm(apart)))
 
 
 class PairMetric(NamedTuple):

@@ -37,7 +37,14 @@ from rs_relpose_ros.pipeline.monitor import (
     Tracked,
     withheld,
 )
-from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result, TrackHistory
+from rs_relpose_ros.pipeline.pair import (
+    Frame,
+    Learned,
+    Lesson,
+    PairResult,
+    Result,
+    TrackHistory,
+)
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
 from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking.features import make_tracker, Tracker
@@ -113,6 +120,7 @@ class Pipeline(Processor[PairResult]):
         self._sensor: Sensor | None = None
         self._readout = 0.0  # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
+        self._lesson: Lesson | None = None  # of the last pair
         self._compare: Callable[[], None] | None = None  # after a pair
         self.reset()
 
@@ -226,7 +234,10 @@ class Pipeline(Processor[PairResult]):
         return False
 
     def prepare(self) -> None:
-        """Assess the configuration and search new corners, after a pair is published."""
+        """Learn from a pair, assess the configuration, search new corners: it is published."""
+        if self._lesson is not None:
+            lesson, self._lesson = self._lesson, None
+            lesson()
         if self._compare is not None:
             compare = self._compare
             self._compare = None
@@ -326,7 +337,7 @@ class Pipeline(Processor[PairResult]):
     def _pair(
         self, history: TrackHistory, frame: Frame[Any], sensor: Sensor, parameters: Parameters
     ) -> PairResult:
-        """The pair, suppressed by the findings on the pairs before; updates the corrections."""
+        """The pair, suppressed by the findings on the pairs before."""
         monitor = self._monitor
         since = history.since
         assert since is not None
@@ -355,18 +366,25 @@ class Pipeline(Processor[PairResult]):
             pose = suppressed(pose, monitor.health)
             if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
-        tracked = Tracked.of(monitor.calibration, configured)
-        self._correct(frame.stamp_ns, tracked, configured)
+        self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured))
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
-        latest = monitor.latest
         return replace(
             history.result(frame, rays, pose, sensor, parameters),
-            images_against_gyro=None if latest is None else latest.images_against_gyro,
             health=monitor.health,
-            tracked=tracked,
-            applied=self.applied,
+            lesson=self._lesson,
             image2=frame.image if self._keep_images else None,
         )
+
+    def _learn(self, stamp_ns: int, configured: Configured) -> Learned:
+        """What the last pair tells of the configuration; updates the corrections."""
+        monitor = self._monitor
+        monitor.learn()
+        of_images = None if monitor.latest is None else monitor.latest.images_by_deviation
+        tracked = Tracked.of(monitor.calibration, configured)
+        self._correct(stamp_ns, tracked, configured)
+        latest = monitor.latest  # None after a step
+        against_gyro = None if latest is None else latest.images_against_gyro
+        return Learned(of_images, against_gyro, tracked, self.applied)
 
     def _correct(self, stamp_ns: int, tracked: Tracked, configured: Configured) -> None:
         """Move the corrections of the next frames towards the estimates, or by a step."""
@@ -526,9 +544,12 @@ class FrameLoop(Generic[Result]):
         stamp_ns: int | None = None
         processor = self._processor
         try:
-            if not self._offline:
-                # The result of the step before is published: no subscriber waits meanwhile.
-                processor.prepare()
+            # The result of the step before is published: no subscriber waits meanwhile.
+            started = time.perf_counter()
+            processor.prepare()
+            prepared = time.perf_counter() - started
+            # Between two frames, so that the offset of a frame depends only on those before it.
+            self.sequencer.apply(processor.applied)
             self.sequencer.gyro_only = processor.gyro_only(self.parameters)
             frame = self.sequencer.take(timeout)
             if not isinstance(frame, Frame):
@@ -538,9 +559,7 @@ class FrameLoop(Generic[Result]):
                 processor.reset()
             started = time.perf_counter()
             frame.result = processor.process(frame, self.parameters)
-            frame.seconds = time.perf_counter() - started
-            # Between two frames, so that the offset of a frame depends only on those before it.
-            self.sequencer.apply(processor.applied)
+            frame.seconds = prepared + time.perf_counter() - started
             return frame
         except Exception as error:
             processor.reset()
