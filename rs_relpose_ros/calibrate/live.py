@@ -244,6 +244,7 @@ class LiveCalibration:
         sensor = self._parameters.sensor
         config = replace(
             TRACKED_IN_IMAGES,
+            offset_at_end=True,
             exposure_time=sensor.exposure_time,
             exposure_margin=sensor.exposure_margin,
             tolerance=_WIDER,

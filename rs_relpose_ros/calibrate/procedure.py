@@ -16,13 +16,23 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag
 from rs_relpose_ros.bags.sensor_topics import SensorTopics
+from rs_relpose_ros.calibrate import following
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
-from rs_relpose_ros.calibration import errors, fit, knowledge, model, observations, repeated
+from rs_relpose_ros.calibration import (
+    errors,
+    fit,
+    knowledge,
+    model,
+    observations,
+    offset_course,
+    repeated,
+)
 from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.calibration.findings_text import with_sigma
 from rs_relpose_ros.calibration.knowledge import LensKnowledge
 from rs_relpose_ros.calibration.observations import (
     GyroSeries,
+    MeasuredRates,
     Observations,
     PairSelection,
     TrackedPoints,
@@ -184,6 +194,12 @@ def _calibrated(
     if config.exposed:
         free |= knowledge.CLAIMED
     data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
+
+    def refitted(changed: Observations, before: fit.Fit) -> tuple[Observations, fit.Fit]:
+        free[model.SLOPE] = changed.stamps.covariates.any()
+        return _fit_with_lens(about, changed, before.unknowns, free, _ALL_PAIRS, rng)
+
+    data, final = following.followed(data, final, refitted, at_end=config.offset_at_end)
     progress(0.7)
     final = errors.widened(final, in_images=config.exposed)
     progress(0.8)
@@ -313,19 +329,28 @@ def _coarse_fit(
     )
     reach = config.max_time_offset + 0.02
     distant = observations.distant_offsets(measured, reach) if config.search_overlap else []
-    starts = observations.find_starts(
-        measured,
-        max_offset=reach,
-        distant=distant,
-        R_prior=R_prior,
-        focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1),
-    )
+
+    def starts_of(rates: MeasuredRates) -> list[observations.Start]:
+        return observations.find_starts(
+            rates,
+            max_offset=reach,
+            distant=distant,
+            R_prior=R_prior,
+            focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1),
+        )
+
+    starts = starts_of(measured)
     if not starts:
         raise InputError('the gyro does not cover the images: record both together')
+    tried = offset_course.tried_offsets(starts[0].offset)
+    course = offset_course.proposed(observations.rates_at(measured, tried, starts[0]))
+    if not course.is_constant:
+        shifts = course.at(0.5 * (begins + ends))
+        starts = starts_of(measured._replace(begins=begins + shifts, ends=ends + shifts)) or starts
     fits = []
     for start in starts:
         lens = np.log(start.focal_factor) * np.eye(N_LENS)[0]
-        data = about(lens)
+        data = about(lens).following(course)
         chosen = data.selected_pairs(_PAIRS_AT_START, start.offset, rng)
         problem = data.problem(chosen, start.offset)
         unknowns = fit.initial(problem, start.R_cam_imu, start.offset)
@@ -348,7 +373,7 @@ def _fit_with_lens(
     seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
     for _ in range(_LENS_ROUNDS):
         moved = about(data.lens + coarse.parameters[model.LENS])
-        data = moved.along(data.camera.readout_axis)
+        data = moved.along(data.camera.readout_axis).following(data.course)
         problem = data.selected_problem(selection, offset, np.random.default_rng(seed))
         if found is not None and np.array_equal(problem.rows[0], found.problem.rows[0]):
             # The same matches: only the lens is linearised again.
@@ -407,6 +432,12 @@ def calibrate_together(
             'columns: calibrate bags of one orientation together, others each alone'
         )
     fits = [one.final for one in found]
+    changing = [number for number, one in enumerate(found) if not one.data.course.is_constant]
+    if changing:
+        raise InputError(
+            f'the clocks change within recording {changing[0] + 1} (a clock was set, or drifts): '
+            'calibrate it alone, and the others together'
+        )
     reference = int(np.argmax([one.problem.begin[-1] for one in fits]))
     lenses = np.array([one.data.lens for one in found])
     jitters = any(one.data.stamps.varying is observations.Varying.JITTER for one in found)
@@ -488,17 +519,18 @@ def evaluated(
     def of(k: int) -> Estimate:
         return _estimate(parameters[k], sigmas[k], wide * _MOST[k])
 
-    slope = _slope(final, parameters, sigmas)
+    slope = _slope(data, final, parameters, sigmas)
     jitters = data.stamps.varying is observations.Varying.JITTER
     lens = None
     if data.knowledge is not LensKnowledge.CLAIMED:
         lens = _lens(data, parameters, covariance, wide, one_axis)
+    offset = _offset_of_row_0(data, parameters, covariance, wide)
     notes = _notes(data, final, parameters, covariance)
     return CalibrationResult(
         readout_time=replace(of(model.READOUT), determined=True),
         readout_axis=data.camera.readout_axis,
         fitted_readout=float(unknowns.parameters[model.READOUT]),
-        time_offset=_offset_of_row_0(data, parameters, covariance, wide),
+        time_offset=offset,
         R_cam_imu=R_cam_imu,
         rotation_sigma=sigmas[model.ROTATION],
         rotation=_estimate(
@@ -514,6 +546,7 @@ def evaluated(
         exposure_margin=data.exposure.margin,
         offset_by_interval=None if jitters else slope,
         offset_by_jitter=slope if jitters else None,
+        offset_changes=following.offset_changes(data, final, offset),
         stamp_jitter=jitters * float(np.sqrt((data.stamps.covariates**2).mean())),
         rotation_rates=rates,
         curve=curve,
@@ -538,9 +571,11 @@ def _notes(
     return unsettled, _UNCLEAR.get(data.stamps.varying, ''), against
 
 
-def _slope(final: fit.Fit, parameters: Array, sigmas: Array) -> Estimate | None:
-    """Change of the offset by a covariate of the frames; None if nothing varies."""
-    if not final.free[model.SLOPE]:
+def _slope(
+    data: Observations, final: fit.Fit, parameters: Array, sigmas: Array
+) -> Estimate | None:
+    """Change of the offset by the interval of the frames; None if that does not vary."""
+    if not (final.free[model.SLOPE] and data.follows_intervals):
         return None
     return _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
 
@@ -628,8 +663,15 @@ def _offset_of_row_0(
     by_parameters[model.OFFSET] = 1.0
     by_parameters[model.READOUT] = -camera.middle_row / camera.row_count
     value = float(by_parameters @ parameters)
-    sigma = math.sqrt(by_parameters @ covariance @ by_parameters)
-    return _estimate(value, sigma, wide * _MOST[model.OFFSET])
+    variance = float(by_parameters @ covariance @ by_parameters)
+    sigma = math.hypot(math.sqrt(variance), following.sigma_over_recording(data))
+    unknown = ''
+    if data.follows_intervals and not data.course.is_constant:
+        unknown = 'a clock was set or drifts, and the offset varies with the intervals as well'
+    offset = _estimate(value, sigma, wide * _MOST[model.OFFSET], unknown)
+    if data.course.drift and not offset.observable:
+        return replace(offset, remark='the clocks drift: no value holds for all of the recording')
+    return offset
 
 
 def _angle_between(first: Array, second: Array) -> float:
@@ -771,7 +813,7 @@ def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '
         float(sigma),
         good,
         '' if good else blocking_reason or _RECORD_MORE,
-        determined=sigma <= _USELESS * limit and not blocking_reason,
+        determined=bool(sigma <= _USELESS * limit and not blocking_reason),
     )
 
 

@@ -44,6 +44,24 @@ class LensEstimates(NamedTuple):
     radial_sigma: float  # of k1 that alone displaces as much as the sigmas of all three
 
 
+class StepOfOffset(NamedTuple):
+    """A clock was set: the offset changes between two times [s] after the first image."""
+
+    begin: float
+    end: float
+    change: Estimate  # [s]
+
+
+class OffsetChanges(NamedTuple):
+    """How the time offset changes within the recording."""
+
+    steps: tuple[StepOfOffset, ...]  # in the order of time
+    drift: Estimate | None  # [s/s]
+    at: float  # time [s] after the first image to which `time_offset` refers
+    # Offset of row 0 [s] before the first step and after each, or in the middle.
+    offsets: tuple[float, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
     """Calibration of a rolling-shutter camera against a gyro.
@@ -71,6 +89,7 @@ class CalibrationResult:
     # stamps jitter; None if they do not.
     offset_by_jitter: Estimate | None
     stamp_jitter: float  # rms about the smooth line [s]
+    offset_changes: OffsetChanges | None  # None if one offset holds for all of the recording
     rotation_rates: Array  # (3,) rms about the camera's axes less mean [rad/s]
     # (2, K) signed readout times [s], and the log-likelihood lost against the best with all other
     # parameters fitted again, scaled to independent pairs.
@@ -183,7 +202,52 @@ def _clock_quantities(result: CalibrationResult) -> list[_Quantity]:
             'exposure'
         )
         rows.append(('jitter of stamps', text, jitter))
+    if result.offset_changes is not None:
+        rows += _change_quantities(result.offset_changes)
     return rows
+
+
+# Parts per million of one. [derived: definition]
+_PPM = 1e6
+
+
+def _change_quantities(changes: OffsetChanges) -> list[_Quantity]:
+    """Steps and the drift of the offset."""
+    rows = []
+    for number, step in enumerate(changes.steps):
+        before, after = changes.offsets[number : number + 2]
+        text = (
+            f'{_rounded(step.change, 2, _MS)} ms between {step.begin:.2f} and {step.end:.2f} s '
+            f'after the first image, where a clock was set: {_MS * before:.2f} ms before, '
+            f'{_MS * after:.2f} ms after'
+        )
+        rows.append(('offset_step', text, step.change))
+    if changes.drift is not None:
+        text = (
+            f'{_rounded(changes.drift, 1, _PPM)} ppm, by which the clocks run apart; the time '
+            f'offset is {_MS * changes.offsets[0]:.2f} ms at {changes.at:.1f} s after the first '
+            'image, and its sigma contains the drift over the recording'
+        )
+        rows.append(('offset_drift', text, changes.drift))
+    return rows
+
+
+def _validity(changes: OffsetChanges | None) -> str:
+    """When a time offset holds that changes within the recording; '' if it is constant."""
+    if changes is None:
+        return ''
+    if changes.drift is not None:
+        return (
+            f' The clocks drift by {_PPM * changes.drift.value:.0f} ppm: time_offset is that at '
+            f'{changes.at:.1f} s after the first image.'
+        )
+    borders = [f'{step.begin:.2f} s' for step in changes.steps]
+    ends = [step.end for step in changes.steps]
+    span = f'until {borders[0]}' if changes.at < ends[0] else f'from {ends[-1]:.2f} s on'
+    return (
+        f' A clock was set {len(borders)} time(s) while it was recorded: time_offset holds {span} '
+        'after the first image.'
+    )
 
 
 def _motion_quantities(result: CalibrationResult) -> list[_Quantity]:
@@ -339,7 +403,7 @@ def holds_for(result: CalibrationResult, camera: RollingShutterCamera) -> str:
         )
     return (
         f'It holds for images of {camera.width}x{camera.height}, the same focus and zoom, and '
-        f'{exposure}.'
+        f'{exposure}.{_validity(result.offset_changes)}'
     )
 
 
@@ -474,6 +538,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'readout_time_s': asdict(result.readout_time),
         'readout_direction': result.readout_direction,
         'time_offset_s': asdict(result.time_offset),
+        'offset_changes': _changes_mapping(result.offset_changes),
         'offset_by_interval': slope and asdict(slope),
         'offset_by_jitter': jitter and asdict(jitter),
         'stamp_jitter_s': result.stamp_jitter,
@@ -494,6 +559,21 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'frame_interval_s': result.frame_interval,
         'warnings': list(result.warnings),
         'cost_over_readout': dict(zip(('readout_s', 'cost'), result.curve.tolist(), strict=True)),
+    }
+
+
+def _changes_mapping(changes: OffsetChanges | None) -> dict[str, Any] | None:
+    if changes is None:
+        return None
+    steps = [
+        {'between_s': [step.begin, step.end], 'change_s': asdict(step.change)}
+        for step in changes.steps
+    ]
+    return {
+        'offset_step': steps,
+        'offset_drift': changes.drift and asdict(changes.drift),
+        'time_offset_at_s': changes.at,
+        'time_offsets_s': list(changes.offsets),
     }
 
 

@@ -76,7 +76,8 @@ def fit(
     of_prior = inverse_curvature @ prior @ inverse_curvature
     of_noise = of_free - of_prior
     formal = inverse_curvature @ found.information @ inverse_curvature
-    wider = np.sqrt(np.maximum(np.diag(formal) / np.diag(of_noise), 1.0))
+    scattered = np.maximum(np.diag(of_noise), np.finfo(float).tiny)
+    wider = np.sqrt(np.maximum(np.diag(formal) / scattered, 1.0))
     of_free = of_noise * np.outer(wider, wider) + of_prior
     if not found.converged:
         of_free += _OF_LEFT**2 * np.outer(found.left, found.left)

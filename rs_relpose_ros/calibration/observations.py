@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import model
 from rs_relpose_ros.calibration.knowledge import LensKnowledge, prior_information
+from rs_relpose_ros.calibration.offset_course import OffsetCourse, RatesAtOffsets
 from rs_relpose_ros.calibration.rotations import rotation_of_rays
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -127,12 +128,13 @@ _SMOOTH = 10.0
 
 
 class Varying(str, Enum):
-    """Why the intervals between frames vary."""
+    """Why the intervals between frames vary, or the offset by time."""
 
     NOT = 'not'  # all are alike
     EXPOSURE = 'exposure'
     JITTER = 'jitter'
     UNCLEAR = 'unclear'
+    COURSE = 'course'  # a clock is set or drifts
 
 
 class FrameTimes(NamedTuple):
@@ -140,7 +142,7 @@ class FrameTimes(NamedTuple):
 
     varying: Varying
     # (F,) [s]: T less its median where the exposure varies, the smooth line less the stamp where
-    # stamps jitter; otherwise zero.
+    # stamps jitter; those of an `OffsetCourse`; otherwise zero.
     covariates: Array
 
 
@@ -271,6 +273,7 @@ class Observations:
     gyro_rates: Array  # (K, 3) mean over the assumed exposure [rad/s]
     blur_rates: Array  # (K, 3) their derivative by its square [rad/s^3]
     gyro_density: float  # white noise of the gyro [rad/s/sqrt(Hz)]
+    course: OffsetCourse = OffsetCourse()  # noqa: RUF009 it is frozen
 
     @classmethod
     def of(
@@ -316,6 +319,28 @@ class Observations:
         camera = replace(self.camera, readout_direction=readout_direction(axis, 1.0))
         return replace(self, camera=camera)
 
+    def following(self, course: OffsetCourse) -> Observations:
+        """The same with an offset that changes as `course`, and by an amount that is estimated.
+
+        Where the offset follows the intervals already, the course is taken as it is.
+        """
+        stamps = self.stamps
+        if course.is_constant and stamps.varying is Varying.COURSE:
+            stamps = FrameTimes(Varying.NOT, np.zeros(len(self.times)))
+        elif not course.is_constant and not self.follows_intervals:
+            stamps = FrameTimes(Varying.COURSE, course.covariates(self.times))
+        return replace(self, course=course, stamps=stamps)
+
+    @property
+    def follows_intervals(self) -> bool:
+        """Whether the offset has the intervals between frames as its covariate."""
+        return self.stamps.varying in (Varying.EXPOSURE, Varying.JITTER)
+
+    @property
+    def gyro_times_of_frames(self) -> Array:
+        """Stamps (F,) [s], from which one offset for all leads to the clock of the gyro."""
+        return np.asarray(self.times + self.course.at(self.times))
+
     @property
     def interval(self) -> float:
         """Median interval between frames [s]."""
@@ -356,8 +381,10 @@ class Observations:
         `offset` [s] is about that of the clocks. InputError if there are fewer than ten pairs.
         """
         pairs, half = self.pairs(selection, rng), 0.5 * self.interval + 0.01
-        begin, end = self.times[frames_of(pairs)] + offset + [[-half], [half]]
+        frames = frames_of(pairs)
+        begin, end = self.gyro_times_of_frames[frames] + offset + [[-half], [half]]
         clear = (begin >= self.gyro_times[0]) & (end <= self.gyro_times[-1])
+        clear &= self.course.clear_of_steps(*self.times[frames])
         for k in np.flatnonzero(np.diff(self.gyro_times) > MAX_GYRO_GAP):
             clear &= (end <= self.gyro_times[k]) | (begin >= self.gyro_times[k + 1])
         pairs = list(itertools.compress(pairs, clear))
@@ -381,7 +408,8 @@ class Observations:
     def problem(self, pairs: Sequence[Pair], offset: float) -> model.Problem:
         """Data of a fit to `pairs`, which the gyro covers at about this `offset` [s]."""
         frames = frames_of(pairs)
-        times1, times2 = self.times[frames]
+        of_frames = self.gyro_times_of_frames
+        times1, times2 = of_frames[frames]
         middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_ROTATION**2)
         center = np.zeros(model.GLOBAL)
@@ -392,7 +420,7 @@ class Observations:
             self.gyro_times,
             self.gyro_rates,
             self.blur_rates,
-            self.times[frames],
+            of_frames[frames],
             self.stamps.covariates[frames],
             np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]),
             middles,
@@ -519,6 +547,21 @@ def find_starts(
         filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
         key=lambda start: start.misfit,
     )
+
+
+def rates_at(measured_rates: MeasuredRates, offsets: Array, start: Start) -> RatesAtOffsets:
+    """Rates of images and gyro at M offsets (M,) [s], in the axes and the lens of a start."""
+    rates, begins, ends, gyro_times, gyro_rates = measured_rates
+    turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
+    lens = np.array([1.0 / start.focal_factor, 1.0 / start.focal_factor, 1.0])
+    order = np.argsort(begins + ends)
+    begins, ends = begins[order], ends[order]
+    gyro = np.full((len(offsets), len(rates), 3), np.nan)
+    for number, offset in enumerate(offsets):
+        known = (begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1])
+        means = _mean_rates(turned, gyro_times, begins[known] + offset, ends[known] + offset)
+        gyro[number, known] = means @ start.R_cam_imu.T
+    return RatesAtOffsets(0.5 * (begins + ends), offsets, rates[order] * lens, gyro)
 
 
 # Step of the times at which sizes of rates are correlated [s]. A longer one would miss a peak.

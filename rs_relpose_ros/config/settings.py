@@ -515,6 +515,11 @@ class CalibrationConfig(Settings):
         'whether an offset beyond max_time_offset is searched, over the whole overlap of images '
         'and gyro',
     )
+    offset_at_end: bool = setting(
+        False,
+        'whether the offset of a clock that was set or drifts is that of the end, for a node that '
+        'goes on, and not that of the begin or the middle',
+    )
     exposed: bool = setting(
         False, 'whether a tracker followed the points in images with an exposure time'
     )
