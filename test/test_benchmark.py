@@ -84,6 +84,8 @@ def test_accuracy_command(tmp_path, capsys, monkeypatch):
         (['trust', '--rows', 'nonsense'], 'no cell is named'),
         (['trust', '--bags', '0'], 'nothing to measure'),
         (['live', '--duration', '1'], '--duration must be at least 5'),
+        (['live', '--every', '0'], '--every must be at least 1'),
+        (['live', '--against', '.', '--every', '2'], 'without --soak, --every and --neighbours'),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 import importlib.util
 from operator import itemgetter
+import os
 from pathlib import Path
 import signal
 import time
@@ -345,7 +346,7 @@ def test_a_run_and_its_report(tmp_path, ros_domain_id, monkeypatch):
     found, over_time = live.run_cell(
         cell,
         clip,
-        3.0,
+        live.Load(3.0),
         tmp_path / cell.name,
         ROOT / 'config' / 'fastdds.xml',
         lambda: seconds.append(1),
@@ -375,3 +376,31 @@ def test_a_run_and_its_report(tmp_path, ros_domain_id, monkeypatch):
     assert header.startswith('cell,duration,frames_sent') and 'latency_p99' in header
     assert first.startswith(f'{cell.name},3.0,88')
     assert 'MB/h' in live.write_soak_report(tmp_path / 'soak', found, over_time)
+
+
+def test_a_node_shares_its_core_with_busy_neighbours(tmp_path, ros_domain_id, monkeypatch):
+    """At half the rate, on a core of its own with two other processes."""
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip('needs two cores')
+    monkeypatch.setattr(live_clip, 'PERIOD', 2.0)
+    before = os.sched_getaffinity(0)
+    cell = live.LiveCell(320, 240, 'mono8', 200)
+    found, _ = live.run_cell(
+        cell,
+        live_clip.prepare_clip(tmp_path, cell.width, cell.height),
+        live.Load(3.0, every=2, neighbours=2),
+        tmp_path / cell.name,
+        ROOT / 'config' / 'fastdds.xml',
+    )
+    assert found.frames_sent == 45 - 1
+    assert found.poses > 3 and found.wrong == 0
+    assert os.sched_getaffinity(0) == before
+
+
+def test_soak_compares_the_first_with_the_last_quarter():
+    seconds = np.arange(0.0, 100.0)
+    course = live.Course(seconds, 10.0 + seconds, seconds, 50.0 + 0.1 * seconds)
+    (first, early, low), (last, late, high) = live.outer_quarters(course)
+    assert (first, last) == ('first', 'last')
+    assert late.p50 - early.p50 == pytest.approx(75.0, abs=1.0)
+    assert high - low == pytest.approx(7.5, abs=0.1)

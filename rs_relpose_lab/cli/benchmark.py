@@ -74,7 +74,9 @@ def run(args: argparse.Namespace) -> int:
     benchmark = BENCHMARKS[args.benchmark]
     for name, _, low in benchmark.arguments:
         value = getattr(args, name.strip('-').replace('-', '_'))
-        if low is not None and (min(value) if isinstance(value, list) else value) < low:
+        if low is None or value is None:
+            continue
+        if (min(value) if isinstance(value, list) else value) < low:
             raise InputError(f'{name} must be at least {low:g}, got {value}')
     return benchmark.run(args)
 
@@ -303,8 +305,18 @@ def _run_speed(args: argparse.Namespace) -> int:
             'default': 0.0,
             'metavar': 'MINUTES',
             'help': 'play the cells so long instead (default: 10), and show memory and latency '
-            'over '
-            'time',
+            'over time, and in the first against the last quarter',
+        },
+        0,
+    ),
+    _number('--every', 1, 'send each Nth image of the 30 a second only: 2 is 15 Hz', low=1),
+    Argument(
+        '--neighbours',
+        {
+            'type': int,
+            'metavar': 'N',
+            'help': 'run the node on one core, with so many busy processes of the same priority: '
+            '2 leave it a third, as on a small board (default: all cores, no such process)',
         },
         0,
     ),
@@ -322,7 +334,13 @@ def _run_live(args: argparse.Namespace) -> int:
     names = matching_cells(args.cells, live.CELLS)
     cells = [live.CELLS[name] for name in names]
     _need_ros()
+    load = live.Load(60.0 * args.soak or args.duration, args.every, args.neighbours)
     if args.against is not None:
+        if load != live.Load(args.duration):
+            raise InputError(
+                '--against plays the cells as every release can: without --soak, --every and '
+                '--neighbours'
+            )
         if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
             raise InputError(
                 f'--against {args.against} is no checkout of this package: give the '
@@ -340,20 +358,19 @@ def _run_live(args: argparse.Namespace) -> int:
                 ),
                 args.output,
             )
-    duration = 60.0 * args.soak or args.duration
     profile = _shipped('fastdds.xml')
     sizes = sorted({(cell.width, cell.height) for cell in cells})
     with progress_bar(len(sizes) * round(FPS * PERIOD), 'frame', 'rendering') as bar:
         clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
     results, failed = [], False
-    with progress_bar(round(len(cells) * duration), 's') as bar:
+    with progress_bar(round(len(cells) * load.duration), 's') as bar:
         for cell in cells:
             bar.set_description(cell.name)
             try:
                 statistics, course = live.run_cell(
                     cell,
                     clips[cell.width, cell.height],
-                    duration,
+                    load,
                     args.output / cell.name,
                     profile,
                     bar.update,

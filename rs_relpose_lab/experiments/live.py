@@ -69,6 +69,16 @@ CELLS = {
 
 
 @dataclass(frozen=True, slots=True)
+class Load:
+    """How the cells are played."""
+
+    duration: float  # [s]
+    every: int = 1  # each so many images of the clip are sent: 2 is 15 Hz
+    # Busy processes on the one core of the node; None: the node may use all cores.
+    neighbours: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Percentiles:
     """Percentiles of values; NaN without values."""
 
@@ -132,17 +142,17 @@ class Course:
 def run_cell(
     cell: LiveCell,
     clip: tuple[Path, Path],
-    duration: float,
+    load: Load,
     folder: Path,
     profile: Path,
     on_second: Callable[[], object] = lambda: None,
 ) -> tuple[LiveStatistics, Course]:
     """Play a clip of the cell's size to a new node; logs and tables into `folder`.
 
-    `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
+    `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
-    from rs_relpose_lab.live.live_run import measure
+    from rs_relpose_lab.live.live_run import measure, NodeSetup
 
     folder.mkdir(parents=True, exist_ok=True)
     compressed = cell.image_format == 'jpeg'
@@ -152,23 +162,25 @@ def run_cell(
         '--loop',
         str(live_clip.PERIOD),
         '--duration',
-        str(duration),
+        str(load.duration),
+        '--every',
+        str(load.every),
         '--topics',
         *topics,
         *([] if compressed else ['--decode', cell.image_format]),
     ]
-    run = measure(
-        *clip,
+    bag, parameters = clip
+    setup = NodeSetup(
+        parameters,
         {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
         'compressed' if compressed else 'raw',
-        player,
         profile if cell.is_big else None,
-        folder,
-        on_second,
+        load.neighbours,
     )
+    run = measure(bag, setup, player, folder, on_second)
     # Processor time and memory of the node, a line per second.
     write_csv(folder / 'node.csv', run.metrics)
-    return statistics_of(cell, duration, run), course_of(run)
+    return statistics_of(cell, load.duration, run), course_of(run)
 
 
 def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStatistics:
@@ -409,6 +421,13 @@ def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str
                 f'the end, {memory_drift(course):+.1f} MB/h after the first tenth.\n'
             ),
             markdown_table(
+                ('quarter', 'latency p50 [ms]', 'p99 [ms]', 'private memory [MB]'),
+                [
+                    (name, f'{latency.p50:.1f}', f'{latency.p99:.1f}', f'{memory:.1f}')
+                    for name, latency, memory in outer_quarters(course)
+                ],
+            ),
+            markdown_table(
                 ('from [min]', 'latency p50 [ms]', 'p99 [ms]'),
                 [
                     (f'{start / 60.0:.1f}', f'{latency.p50:.1f}', f'{latency.p99:.1f}')
@@ -437,6 +456,25 @@ def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
         )
         for start in starts
     ]
+
+
+def outer_quarters(course: Course) -> list[tuple[str, Percentiles, float]]:
+    """Latency and mean private memory [MB] of the first and of the last quarter of a run."""
+    end = float(course.latency_seconds[-1])
+    found = []
+    for name, begin in (('first', 0.0), ('last', 0.75 * end)):
+        last = begin + 0.25 * end
+        of_pairs = (course.latency_seconds >= begin) & (course.latency_seconds <= last)
+        of_memory = (course.memory_seconds >= begin) & (course.memory_seconds <= last)
+        memory = course.private[of_memory]
+        found.append(
+            (
+                name,
+                Percentiles.of(course.latencies[of_pairs]),
+                float(memory.mean()) if len(memory) else float('nan'),
+            )
+        )
+    return found
 
 
 def memory_drift(course: Course) -> float:

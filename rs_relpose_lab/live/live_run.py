@@ -188,38 +188,48 @@ class _Listener:
         return received
 
 
+@dataclass(frozen=True, slots=True)
+class NodeSetup:
+    """How a node is started."""
+
+    parameters: Path  # file
+    remap: dict[str, str]  # its topics image, camera_info and imu by their names in the bag
+    transport: str  # its parameter `image_transport`
+    profile: Path | None  # of Fast DDS, for all processes
+    # Busy processes of the same priority on the one core that the node then has; None: the node
+    # may use all cores.
+    neighbours: int | None = None
+
+
 def measure(
     bag: Path,
-    parameters: Path,
-    remap: dict[str, str],
-    transport: str,
+    setup: NodeSetup,
     player_options: Sequence[str],
-    profile: Path | None,
     folder: Path,
     on_second: Callable[[], object],
 ) -> MeasuredRun:
     """Play a bag to a new node and measure; logs and tables into `folder`, which exists.
 
-    `parameters`: file of the node, `remap`: its topics image, camera_info and imu by their names
-    in the bag, `transport`: its `image_transport`. `profile`: of Fast DDS, for all processes.
     `on_second`: called once a second while messages are played.
     """
     timings, log = folder / 'frames.csv', folder / 'player.npy'
+    remap = setup.remap
     log.unlink(missing_ok=True)
-    with private_domain():
-        if profile is not None:
-            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
+    with private_domain(), processes.core_for(setup.neighbours) as pin:
+        if setup.profile is not None:
+            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(setup.profile)
         else:
             os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
         with Graph() as graph:
             listener = _Listener(graph)
             started_ns = time.monotonic_ns()
             with processes.node_process(
-                parameters,
+                setup.parameters,
                 remap=remap,
                 log=folder / 'relpose_node.log',
-                parameters={'timings_file': timings, 'image_transport': transport},
+                parameters={'timings_file': timings, 'image_transport': setup.transport},
             ) as node:
+                pin(node)
                 processes.wait_until(
                     lambda: graph.node.count_subscribers(remap['imu']),
                     'a subscription of the node',

@@ -200,8 +200,12 @@ def _outgoing(
     bag: reader.Bag, topics: Sequence[sensor_topics.Topic], options: argparse.Namespace
 ) -> Iterator[Outgoing]:
     first_ns: int | None = None
+    images = 0
     for raw in bag.raw_messages(topics):
         first_ns = raw.bag_time_ns if first_ns is None else first_ns
+        images += raw.msgtype in _IMAGES
+        if raw.msgtype in _IMAGES and (images - 1) % options.every:
+            continue
         data = bytes(raw.data)
         if options.decode and raw.msgtype == sensor_topics.COMPRESSED_IMAGE:
             compressed = deserialize_message(data, message_class(sensor_topics.COMPRESSED_IMAGE))
@@ -279,6 +283,13 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         '--topics', nargs='+', default=(), metavar='TOPIC', help='only these topics of the bag'
     )
     parser.add_argument(
+        '--every',
+        type=int,
+        default=1,
+        metavar='N',
+        help='publish each Nth image only, as a slower camera (default: all)',
+    )
+    parser.add_argument(
         '--wait-for-subscribers',
         type=float,
         default=0.0,
@@ -317,6 +328,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     given = parser.parse_args(arguments)
     if given.loop < 0.0 or given.duration <= 0.0:
         parser.error('--loop and --duration must be positive')
+    if given.every < 1:
+        parser.error('--every must be at least 1')
     return given
 
 

@@ -1,6 +1,7 @@
 """Processes of a live run, the nodes and a player: start, log, wait, signals, end, load."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -170,6 +171,33 @@ def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process)
         if count() != known:
             known, since = count(), time.monotonic()
         time.sleep(0.05)
+
+
+@contextmanager
+def core_for(neighbours: int | None) -> Iterator[Callable[[Process], None]]:
+    """Keep one core for the process that the yielded function gets, and `neighbours` on it.
+
+    The neighbours are busy all the time, at the same priority: two leave a third of the core to
+    one thread. This process and those it starts have the other cores. None keeps no core.
+    """
+    if neighbours is None:
+        yield lambda process: None
+        return
+    cores = os.sched_getaffinity(0)
+    if len(cores) < 2:
+        raise LiveRunError('a core of its own for the node needs a machine with two cores')
+    core = max(cores)
+    busy = [Process('-c', 'while True: pass') for _ in range(neighbours)]
+    with ExitStack() as stack:
+        for one in busy:
+            stack.enter_context(one)
+            os.sched_setaffinity(one.pid, {core})
+        os.sched_setaffinity(0, cores - {core})
+        try:
+            # Threads that a process starts later have the cores of their process.
+            yield lambda process: os.sched_setaffinity(process.pid, {core})
+        finally:
+            os.sched_setaffinity(0, cores)
 
 
 @dataclass(frozen=True, slots=True)
