@@ -54,6 +54,7 @@ from rs_relpose_ros.calibration.observations import (
 from rs_relpose_ros.calibration.repeated import combined
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
+from rs_relpose_ros.core import radial
 from rs_relpose_ros.core.deviations import OFFLINE
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -277,7 +278,7 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
     for estimate, true in zip(result.lens.radial, lens.radial_coefficients, strict=True):
         assert abs(estimate.value - true) < 3.0 * estimate.sigma
     # What it does to the image is known better than by the prior.
-    corner = knowledge.displacements([knowledge.corner_radius(lens)])[0]
+    corner = radial.displacements([radial.corner_radius(lens)])[0]
     displacement = result.lens.displacement
     assert displacement.sigma < 0.01
     assert abs(displacement.value - corner @ lens.radial_coefficients) < 3.0 * displacement.sigma
@@ -291,7 +292,7 @@ def test_prior_of_a_lens_is_on_what_it_does_to_the_image(given):
     """2 % of the radius at the corner and 1 % at half of it; a guess may have a k1 of 0.3."""
     camera = camera_of(recorded().truth)
     covariance = knowledge.distortion_prior(camera, given=given)
-    radius = knowledge.corner_radius(camera)
+    radius = radial.corner_radius(camera)
     assert radius == pytest.approx(
         np.linalg.norm([0.5 * camera.width, 0.5 * camera.height]) / camera.fx
     )

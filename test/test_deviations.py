@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 
+from rs_relpose_ros.core import radial
 from rs_relpose_ros.core.deviations import (
     ENTRIES,
     LIVE,
     N_DEVIATIONS,
     OFFLINE,
+    PARTS,
     Selection,
 )
 from rs_relpose_ros.geometry import lens
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 
 def test_parts_of_the_vector_follow_one_another():
@@ -31,6 +34,26 @@ def test_a_selection_is_the_basis_of_its_values():
     assert np.count_nonzero(values) == 4
     assert chosen.sigmas.tolist() == [0.05, 0.2]
     assert chosen.mask('gyro_scale').tolist() == [False, True]
+
+
+def test_values_of_a_camera_are_its_width_and_shapes_of_its_lens():
+    camera = RollingShutterCamera(
+        width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0, readout_time=0.0
+    )
+    basis = LIVE.of_camera(camera)
+    at_lens = np.ix_(range(N_DEVIATIONS)[PARTS['distortion']], range(LIVE.size))
+    shapes = basis[at_lens][:, LIVE.part('distortion')]
+    # The first one is k1 alone. The others displace points by 2 % of the radius at the corner, and
+    # are independent of it by the prior.
+    assert shapes[:, 0].tolist() == [1.0, 0.0, 0.0]
+    radius = radial.corner_radius(camera)
+    prior = radial.prior_covariance(radius)
+    scaled = shapes * radial.WRONG_SIGMA
+    weights = scaled.T @ np.linalg.inv(prior) @ scaled
+    np.testing.assert_allclose(weights[1:, 1:], np.eye(2), atol=1e-6)
+    np.testing.assert_allclose(weights[0, 1:], 0.0, atol=1e-6 * weights[0, 0])
+    center = basis[PARTS['principal_point'], LIVE.part('principal_point')]
+    np.testing.assert_array_equal(center, 640 * np.eye(2))
 
 
 def test_the_order_is_the_order_of_the_table_whoever_selects():

@@ -36,6 +36,7 @@ from rs_relpose_ros.calibration.rotations import AccelerationSums, rotation_of_r
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
 from rs_relpose_ros.core.deviations import LENS, LIVE, N_DEVIATIONS, PARTS
+from rs_relpose_ros.core.radial import corner_radius, displacements, independent_shapes
 from rs_relpose_ros.core.rows import row_states, RowStates
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.arguments import estimate_relative_pose
@@ -62,7 +63,8 @@ from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 
 AXES, BIAS = LIVE.part('axes'), LIVE.part('gyro_bias')
 OFFSET, READOUT = LIVE.index('time_offset'), LIVE.index('readout_time')
-SCALE, FOCAL, DISTORTION = map(LIVE.index, ('gyro_scale', 'focal_log', 'distortion'))
+SCALE, FOCAL = map(LIVE.index, ('gyro_scale', 'focal_log'))
+DISTORTION = LIVE.part('distortion')
 CENTER = LIVE.part('principal_point')
 DEVIATIONS = LIVE.size
 MS = 1_000_000
@@ -82,13 +84,15 @@ CAMERA = RollingShutterCamera(
 PARAMETERS = Parameters.from_mapping(
     {'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())}
 )
-# Small deviations: rad, s, s, rad/s, -, -, -, widths.
-SMALL = np.array([3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01, 0.01] + [3e-3] * 2)
+# Small deviations: rad, s, s, rad/s, -, -, shapes of the lens, widths.
+SMALL = np.array(
+    [3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01] + [0.01, 0.02, 0.02] + [3e-3] * 2
+)
 CONFIGURED = Configured(
     PARAMETERS.sensor,
     CAMERA,
     np.zeros(3),
-    assessment.configured_sigmas(PARAMETERS, 0.0, CAMERA.width),
+    assessment.configured_sigmas(PARAMETERS, 0.0, CAMERA),
     NONE,
 )
 
@@ -133,14 +137,11 @@ def gyro(start, end, c):
 def deviating(camera, c):
     """The camera with the deviations `c` of lens and readout."""
     signed = camera.line_delay * camera.height + c[READOUT]
-    first, *others = camera.distortion
+    coefficients = independent_shapes(corner_radius(camera)) @ c[DISTORTION]
+    center = camera.width * c[CENTER]
+    lens = np.concatenate([[c[FOCAL], 0.0], coefficients, center])
     return replace(
-        camera,
-        fx=camera.fx * math.exp(c[FOCAL]),
-        fy=camera.fy * math.exp(c[FOCAL]),
-        cx=camera.cx + camera.width * c[CENTER][0],
-        cy=camera.cy + camera.width * c[CENTER][1],
-        distortion=(first + c[DISTORTION], *others),
+        camera.moved_lens(lens),
         readout_time=abs(signed),
         readout_direction='down' if signed >= 0.0 else 'up',
     )
@@ -197,7 +198,7 @@ def test_pairs_are_exact_at_times_that_are_far_off():
 
 @pytest.mark.parametrize(
     'signs',
-    [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1, 1, -1]],
+    [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1, -1, 1, 1, -1]],
     ids=[*map(str, range(DEVIATIONS)), 'all'],
 )
 def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
@@ -293,7 +294,7 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
 @pytest.mark.parametrize('name', ['focal_log', 'distortion'])
 def test_a_deviation_shifts_the_rotation_by_the_images_alone(name):
     """Against pairs that are exact but for the deviation, at the middle rows."""
-    c = deviation(**{name: {'focal_log': -0.01, 'distortion': 2e-3}[name]})
+    c = deviation(**{name: {'focal_log': -0.01, 'distortion': [2e-3, 0.0, 0.0]}[name]})
 
     def off(start, wrong):
         """Error of the rotation by the images alone, and J."""
@@ -323,7 +324,7 @@ def test_a_deviation_shifts_the_rotation_by_the_images_alone(name):
         right, J, root = off(start, NONE)
         wrong, *_ = off(start, -c)
         columns = IMAGES.part(name)
-        expected = J[:3, columns] @ c[LIVE.part(name)]
+        expected = J[:3, columns] @ c[LIVE.part(name)][: columns.stop - columns.start]
         # In sigmas: directions that the images hardly determine move far.
         moved = root @ (wrong - right)
         assert np.linalg.norm(moved - root @ expected) < 0.7 * np.linalg.norm(moved) + 1.0
@@ -337,7 +338,7 @@ MOVING = {
     'gyro_bias': [2e-3, -2e-3, 2e-3],
     'gyro_scale': 0.01,
     'focal_log': -0.005,
-    'distortion': 3e-3,
+    'distortion': [3e-3, -0.02, 0.02],
     'principal_point': [2e-3, -2e-3],
 }
 
@@ -718,7 +719,7 @@ def calibration(c, sigma, coupled=0.0):
     )
 
 
-SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01] + [1e-3] * 2)
+SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3] + [0.01] * 3 + [1e-3] * 2)
 # Ten sigmas of a deviation turn a pose by its own sigma.
 EFFECT = assessment.Effect(
     *(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6))
@@ -773,9 +774,10 @@ def test_the_error_that_linearisation_leaves_is_in_the_sigma():
     c = deviation(time_offset=0.02)
     estimated = replace(calibration(c, SIGMA), about=deviation(time_offset=0.014))
     (found,) = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
-    assert found.sigma[OFFSET] == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
+    sigma = math.sqrt(found.covariance[OFFSET, OFFSET])
+    assert sigma == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
     (fault,) = assessed(estimated).faults
-    assert fault.sigma == pytest.approx(math.hypot(found.sigma[OFFSET], 0.002), rel=0.01)
+    assert fault.sigma == pytest.approx(math.hypot(sigma, 0.002), rel=0.01)
 
 
 @pytest.mark.parametrize(('size', 'likely'), [(1.5, 0.0), (3.0, 3.0)])
@@ -787,6 +789,55 @@ def test_times_that_are_likely_to_be_off_are_linearised_there(size, likely):
         deviation(time_offset=likely * SIGMA[OFFSET]),
         rtol=0.01,
     )
+
+
+def test_distortion_is_found_as_the_coefficients_that_it_is():
+    """Of two cameras whose k1 is cancelled towards the edge; the finding has all three."""
+    shapes = independent_shapes(corner_radius(CAMERA))
+    off = np.array([0.163, -0.520, 0.474])
+    c = deviation(distortion=np.linalg.solve(shapes, off))
+    faults = {one.code: one for one in assessed(calibration(c, SIGMA)).faults}
+    # The remaining displacement of the corner is small: it may also be a rectified image.
+    assert faults.keys() == {'distortion', 'image_geometry'}
+    fault = faults['distortion']
+    assert fault.state is not FindingState.OK
+    right = CAMERA.radial_coefficients + off
+    np.testing.assert_allclose(fault.estimated, right, atol=3.0 * fault.sigma)
+    k1, k2, *_ = fault.settings['distortion_coefficients']
+    np.testing.assert_allclose((k1, k2), fault.estimated[:2], atol=1e-5)
+    assert fault.settings['distortion_coefficients'][4] == pytest.approx(
+        fault.estimated[2], abs=1e-5
+    )
+    assert 'k1, k2, k3' in text_of(fault).message
+
+
+def test_distortion_of_a_lens_that_is_given_without_is_named_by_pairs():
+    """Of a RealSense; by k1 alone it would be small, or another parameter."""
+    given = replace(CAMERA, distortion=())
+    off = np.array([0.163, -0.520, 0.474])
+    c = deviation(distortion=np.linalg.solve(independent_shapes(corner_radius(given)), off))
+    rng, sums = np.random.default_rng(3), Posterior()
+    for k in range(12):
+        pair = pair_data(0.4 * k, 0.4 * k + 0.3, c, given)
+        noise = 0.3 * rng.normal(size=(2, *pair.points1.shape))
+        pair = replace(pair, points1=pair.points1 + noise[0], points2=pair.points2 + noise[1])
+        assert sums.add(400 * MS * k, pair, NONE, NONE) is not None
+    faults = assessed(sums.solved(), configured=replace(CONFIGURED, camera=given)).faults
+    assert [fault.code for fault in faults] == ['distortion']
+    np.testing.assert_allclose(faults[0].estimated, off, atol=3.0 * faults[0].sigma)
+
+
+def test_configured_sigma_of_the_lens_is_that_of_what_it_does_to_the_image():
+    """All three coefficients are uncertain, by the displacement of the stated sigma of k1."""
+    sigmas = assessment.configured_sigmas(
+        Parameters.from_mapping({'distortion_sigma': 0.02}), 0.0, CAMERA
+    )[DISTORTION]
+    radius = corner_radius(CAMERA)
+    shapes = independent_shapes(radius)
+    by_values = displacements(radius * np.linspace(0.5, 1.0, 6)) @ shapes
+    of_first = displacements(radius * np.linspace(0.5, 1.0, 6))[:, 0] * 0.02
+    assert (np.linalg.norm(by_values * sigmas, axis=1) / of_first).max() == pytest.approx(1.0)
+    assert (sigmas > 0.0).all()
 
 
 def test_configured_sigmas_bound_what_a_deviation_may_explain():
@@ -809,7 +860,7 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
             }
         ),
         from_reference=0.01,
-        width=640,
+        camera=CAMERA,
     )
     assert small[OFFSET] == pytest.approx(5e-4) and small[BIAS].tolist() == [0.003] * 3
     doubt = np.sqrt(
@@ -817,7 +868,7 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
             assessment.undetermined(posterior.NOTHING_ESTIMATED, replace(CONFIGURED, sigmas=small))
         )
     )
-    given = [0, 1, 2, OFFSET, READOUT, FOCAL, DISTORTION, *range(CENTER.start, CENTER.stop)]
+    given = [0, 1, 2, OFFSET, READOUT, *range(FOCAL, DEVIATIONS)]
     np.testing.assert_allclose(doubt[given], small[given])
     # Of eight quantities two are not known: the odds are 2 to 8 that one of them is off.
     assert doubt[SCALE] == pytest.approx(math.sqrt(2 / 10) * LIVE.sigmas[SCALE])

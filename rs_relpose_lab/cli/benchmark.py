@@ -647,8 +647,8 @@ def _run_reconstruction(args: argparse.Namespace) -> int:
 
 @_benchmark(
     'calibration-lenses',
-    '`rs_relpose calibrate` on rendered bags, of unknown lenses if not --known, and the poses '
-    'with its file against those with the true calibration',
+    '`rs_relpose calibrate` on rendered bags, of unknown lenses if not --known, and the poses of '
+    'another bag of each camera with its file against those with the true calibration',
     _number('--bags', 10, 'bags, each with a lens of its own', low=1),
     _number('--seconds', 20.0, 'length of a bag'),
     Argument(

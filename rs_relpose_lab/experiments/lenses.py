@@ -19,20 +19,34 @@ from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.live import LiveCalibration
 from rs_relpose_ros.calibrate.stored import Calibrated
+from rs_relpose_ros.calibration.knowledge import distortion_prior
 from rs_relpose_ros.calibration.observations import axis_maps
 from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.config.files import read_parameters, SourcedValue, write_parameters
 from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.core.radial import corner_radius, displacements
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.messages.incoming import Role, sensor_messages, stamp_ns
 
-# First coefficient of each model: least and largest.
+# First coefficient of each model: least and largest. To it are added k1, k2, k3 drawn from the
+# prior of a lens that is given, by which the displacement is 1 % at half of the radius.
 MODELS = {'plumb_bob': (-0.2, 0.1), 'equidistant': (-0.05, 0.05)}
+# Standard deviations within which the drawn coefficients stay.
+# [chosen: 2; a lens beyond 3 is rarer than a wrong calibration]
+_WITHIN = 2.0
+# Added to the seed of a bag for the motion, scene and noise of the other bag of its camera.
+# [chosen: beyond the seeds of all bags of one run]
+_OTHER_SEED = 10_000
 # Focal length over that assumed by `calibrate`, 0.8 widths; error of the principal point [px].
 FOCAL, CENTER = (0.8, 1.2), 10.0
-LENS = ('focal length [%]', 'first coefficient', 'principal point [px]')  # the larger of both
+# Quantities of the lens in the report. The displacement by k1, k2, k3 is that of the image's
+# corner, and the principal point that of the coordinate that is further off.
+LENS = ('focal length [%]', 'displacement of the corner [%]', 'principal point [px]')
 # Largest rotation of the IMU about each axis, from one of the 24 axis maps [deg].
 MISALIGNED = 3.0
+# Points across half of the image's diagonal at which a drawn lens must have an inverse.
+# [chosen: 5 to 50 would do, as the profile has three coefficients]
+_INVERTED_AT = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,21 +91,35 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         time_offset=round(rng.uniform(-0.08, 0.08), 4),
     )
     camera, shift = config.camera, rng.uniform(-CENTER, CENTER, 2)
-    others = (0.0,) * (3 if model == 'equidistant' else 4)
-    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     camera = replace(
         camera,
         cx=0.5 * (camera.width - 1) + shift[0],
         cy=0.5 * (camera.height - 1) + shift[1],
         distortion_model=model,
-        distortion=(float(rng.uniform(*MODELS[model])), *others),
+        distortion=(),
     )
-    while np.isnan(camera.unproject(corners)).any():
-        camera = replace(camera, distortion=(0.9 * camera.distortion[0], *others))  # no such lens
+    camera = _distorted(camera, rng)
     axes = Rotation.from_rotvec(
         rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True
     ) * Rotation.from_matrix(axis_maps()[rng.integers(24)])
     return replace(config, quat_cam_imu_xyzw=tuple(axes.as_quat().tolist())), camera
+
+
+def _distorted(camera: RollingShutterCamera, rng: np.random.Generator) -> RollingShutterCamera:
+    """The camera with a lens that is drawn, and drawn again until it has an inverse."""
+    root = np.linalg.cholesky(distortion_prior(camera, given=True))
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    center = np.array([camera.cx, camera.cy])
+    shares = np.linspace(0.0, 1.0, _INVERTED_AT)
+    points = (center + shares[:, None, None] * (corners - center)).reshape(-1, 2)
+    while True:
+        drawn = np.clip(rng.standard_normal(3), -_WITHIN, _WITHIN)
+        by_prior = root @ drawn
+        first = np.array([rng.uniform(*MODELS[camera.distortion_model]), 0.0, 0.0])
+        deviation = np.array([0.0, 0.0, *(first + by_prior), 0.0, 0.0])
+        lens = camera.moved_lens(deviation)
+        if not np.isnan(lens.unproject(points)).any():
+            return lens
 
 
 def calibrated_live(bag: Path, parameters: Path) -> float:
@@ -117,16 +145,15 @@ def calibrated_live(bag: Path, parameters: Path) -> float:
     return math.nan
 
 
-def on_lens(
-    seed: int, model: str, seconds: float, folder: Path, *, live: bool, known: bool
-) -> LensRun:
-    """Render a bag unless it exists, calibrate, and replay with both calibrations.
-
-    live: by the calibration of a running node, which ends as soon as its result suffices. known:
-    the lens is that of the CameraInfo.
-    """
-    config, camera = lens_of(seed, model)
-    config = replace(config, duration=seconds, plan=f'walk:{seconds}')
+def _rendered(
+    config: SimulationConfig,
+    camera: RollingShutterCamera,
+    folder: Path,
+    name: str,
+    *,
+    known: bool,
+) -> tuple[Path, Path]:
+    """A bag of a camera and its true parameters, rendered unless they exist."""
 
     def render(bag: Path, parameters: Path) -> None:
         simulation = simulate(config, camera=camera)
@@ -144,7 +171,23 @@ def on_lens(
             [SourcedValue(name, value, '') for name, value in values.items()],
         )
 
-    bag, truth = made_once(folder, 'bag', render)
+    return made_once(folder, name, render)
+
+
+def on_lens(
+    seed: int, model: str, seconds: float, folder: Path, *, live: bool, known: bool
+) -> LensRun:
+    """Render two bags of a camera unless they exist, calibrate on one, and replay the other.
+
+    The other one is replayed with the calibration and with the true values. live: by the
+    calibration of a running node, which ends as soon as its result suffices. known: the lens is
+    that of the CameraInfo.
+    """
+    config, camera = lens_of(seed, model)
+    config = replace(config, duration=seconds, plan=f'walk:{seconds}')
+    other = replace(config, seed=seed + _OTHER_SEED, scene=SCENES[(seed + 1) % len(SCENES)])
+    bag, _ = _rendered(config, camera, folder, 'bag', known=known)
+    replayed, truth = _rendered(other, camera, folder, 'other', known=known)
     parameters = folder / 'calibration' / 'calibration.yaml'
     if live:
         parameters = folder / 'live.yaml'
@@ -160,13 +203,13 @@ def on_lens(
                 *([] if known else ['--lens', model]),
             ]
         )
-    run = LensRun(model, seed, code, seconds, _poses(bag, truth))
+    run = LensRun(model, seed, code, seconds, _poses(replayed, truth))
     if code:
         return run
     found = read_parameters(parameters)
     return replace(
         run,
-        calibrated=_poses(bag, parameters),
+        calibrated=_poses(replayed, parameters),
         errors=_errors(found, config) | ({} if known else _of_lens(found, camera)),
     )
 
@@ -187,12 +230,15 @@ def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float
 def _of_lens(found: Parameters, truth: RollingShutterCamera) -> dict[str, tuple[float, float]]:
     sigmas, lens = found.intrinsics, found.intrinsics.of_image(truth.width, truth.height)
     center = max(abs(lens.cx - truth.cx), abs(lens.cy - truth.cy))
+    radius = corner_radius(truth)
+    coefficients = lens.global_shutter_camera().radial_coefficients - truth.radial_coefficients
+    displaced = float(displacements([radius])[0] @ coefficients)
     return dict(
         zip(
             LENS,
             (
                 (100.0 * (lens.fx / truth.fx - 1.0), 100.0 * sigmas.focal_length_sigma),
-                (lens.distortion[0] - truth.distortion[0], sigmas.distortion_sigma),
+                (100.0 * displaced, 100.0 * radius**2 * sigmas.distortion_sigma),
                 (center, sigmas.principal_point_sigma),
             ),
             strict=True,

@@ -40,6 +40,7 @@ from rs_relpose_ros.calibration.observations import (
 from rs_relpose_ros.calibration.readout_axis import along_other_axis
 from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
+from rs_relpose_ros.core import radial
 from rs_relpose_ros.core.deviations import by_name, OFFLINE
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
@@ -628,10 +629,10 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
     The lens is not in the parameter file, and the axes would be wrong with another one.
     """
     camera = data.camera.moved_lens(parameters[model.LENS])
-    radial = ', '.join(f'{one:.3f}' for one in camera.radial_coefficients)
+    coefficients = ', '.join(f'{one:.3f}' for one in camera.radial_coefficients)
     values = {
         'focal_log': f'a focal length of {camera.fx:.1f} px',
-        'distortion': f'a distortion k1, k2, k3 of {radial}',
+        'distortion': f'a distortion k1, k2, k3 of {coefficients}',
         'principal_point': f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px',
     }
     off = np.zeros(model.GLOBAL)
@@ -701,7 +702,9 @@ def _lens(
         Estimate(camera.cy, row_sigma, True),
         camera.distortion,
         _displacement(camera, coefficients, covariance[model.DISTORTION, model.DISTORTION]),
-        _equivalent_sigma(camera, covariance[model.DISTORTION, model.DISTORTION]),
+        radial.equivalent_sigma(
+            radial.corner_radius(camera), covariance[model.DISTORTION, model.DISTORTION]
+        ),
     )
 
 
@@ -709,22 +712,9 @@ def _displacement(
     camera: RollingShutterCamera, coefficients: list[float], covariance: Array
 ) -> Estimate:
     """Displacement of the corner of the image by k1, k2, k3, over its radius."""
-    by_coefficients = knowledge.displacements([knowledge.corner_radius(camera)])[0]
+    by_coefficients = radial.displacements([radial.corner_radius(camera)])[0]
     sigma = math.sqrt(by_coefficients @ covariance @ by_coefficients)
     return Estimate(float(by_coefficients @ coefficients), sigma, True)
-
-
-# Shares of the corner's radius at which displacements are compared. Nearer to the middle there are
-# few pixels. [chosen: the outer three quarters of the area]
-_COMPARED_RADII = np.linspace(0.5, 1.0, 6)
-
-
-def _equivalent_sigma(camera: RollingShutterCamera, covariance: Array) -> float:
-    """Sigma of k1 that alone displaces as much as the covariance (3, 3) of k1, k2, k3."""
-    radii = knowledge.corner_radius(camera) * _COMPARED_RADII
-    by_coefficients = knowledge.displacements(radii)
-    variances = np.einsum('ni,ij,nj->n', by_coefficients, covariance, by_coefficients)
-    return float(np.max(np.sqrt(variances) / by_coefficients[:, 0]))
 
 
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:

@@ -30,8 +30,13 @@ from rs_relpose_ros.calibration.rotations import RotationComparison
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
+from rs_relpose_ros.core.radial import corner_radius, displacements, independent_sigmas
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import readout_direction, REFERENCE_ROWS
+from rs_relpose_ros.geometry.camera import (
+    readout_direction,
+    REFERENCE_ROWS,
+    RollingShutterCamera,
+)
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 
@@ -105,22 +110,29 @@ _TRACE = 0.34
 
 
 def configured_sigmas(
-    parameters: Parameters, from_reference: float, width: int, offset_sigma: float = 0.0
+    parameters: Parameters,
+    from_reference: float,
+    camera: RollingShutterCamera,
+    offset_sigma: float = 0.0,
 ) -> Array:
     """1 sigma (K,) of the deviations by the parameters, 0 where they are not known.
 
     `from_reference` [s]: interval between frames less that to which the time offset refers.
-    `width` [px]: of the image. `offset_sigma` [s]: of the stamps of the gyro, which adds to the
-    sigma of the time offset.
+    `offset_sigma` [s]: of the stamps of the gyro, which adds to the sigma of the time offset.
     """
     sensor, sigmas = parameters.sensor, np.zeros(LIVE.size)
-    for name, sigma in parameters.deviation_sigmas().items():
+    configured = parameters.deviation_sigmas()
+    for name, sigma in configured.items():
         if name in LIVE.parts:
             sigmas[LIVE.part(name)] = sigma
+    sigmas[LIVE.part('distortion')] = independent_sigmas(
+        corner_radius(camera), configured['distortion']
+    )
+    sigmas[LIVE.part('principal_point')] /= camera.width
     by_interval = from_reference * sensor.time_offset_per_interval_sigma
     offset = LIVE.index('time_offset')
     sigmas[offset] = math.hypot(sigmas[offset], by_interval, offset_sigma)
-    return np.asarray(sigmas / LIVE.scales(width))
+    return sigmas
 
 
 class Effect(NamedTuple):
@@ -135,7 +147,7 @@ class Inconsistency(NamedTuple):
 
     quantity: Quantity
     deviation: Array  # (K,) from the active values; of this quantity alone
-    sigma: Array  # (K,)
+    covariance: Array  # (K, K)
     certainty: float  # in sigmas
     # Of the pose, Mahalanobis: in sigmas of a correctly configured one, of the pairs that it
     # moves most, and in published sigmas, in the median.
@@ -305,8 +317,13 @@ class Solution(NamedTuple):
     @property
     def moment(self) -> Array:
         """Second moment (K, K) with these sigmas."""
+        return self.widened_covariance + np.outer(self.off, self.off)
+
+    @property
+    def widened_covariance(self) -> Array:
+        """Covariance (K, K) with these sigmas."""
         widths = self.sigma / np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        return self.covariance * np.outer(widths, widths) + np.outer(self.off, self.off)
+        return self.covariance * np.outer(widths, widths)
 
     def _along(self, part: slice) -> Array:
         """Direction of some deviations in which they are most certain, times their gain."""
@@ -360,9 +377,8 @@ def _inconsistency(
         for k, quantile in enumerate((_OBSERVABLE_IN, 0.5))
     )
     step = solution.active + solution.off - solution.estimated.about  # of the linearisation
-    return Inconsistency(
-        quantity, deviation, np.hypot(solution.sigma, _REMAINS * step), certainty, shift, claimed
-    )
+    covariance = solution.widened_covariance + np.diag((_REMAINS * step) ** 2)
+    return Inconsistency(quantity, deviation, covariance, certainty, shift, claimed)
 
 
 def assess(
@@ -396,13 +412,16 @@ def assess(
         part = quantity.part
         if quantity.code in faults:
             found += _fault_findings(faults[quantity.code], estimated, configured, candidates)
-        elif float(estimated.sigma[part].max()) > quantity.observable:
+        elif quantity.uncertainty(configured, estimated.covariance[part, part]) > (
+            quantity.observable
+        ):
             found.append(quantity.unknown(Why.NOT_OBSERVABLE))
         elif faults:
             found.append(quantity.unknown(Why.OTHER_INCONSISTENT, next(iter(faults))))
         else:
             left = (estimated.c - configured.active)[part]
-            found.append(_values(quantity, left, estimated.sigma[part], configured, estimated))
+            covariance = estimated.covariance[part, part]
+            found.append(_values(quantity, left, covariance, configured, len(estimated.b)))
     return findings.Assessment(tuple(found))
 
 
@@ -425,9 +444,11 @@ def _fault_findings(
     quantity = one.quantity
     sure = one.claimed_shift * (1.0 - 2.0 / one.certainty)
     state = FindingState.WRONG if sure > _OUTSIDE else FindingState.SUSPECT
-    left = one.deviation[quantity.part]
-    sigmas = np.hypot(one.sigma[quantity.part], _SELECTED * np.linalg.norm(one.deviation))
-    consistent = _values(quantity, left, sigmas, configured, estimated)
+    part = quantity.part
+    left = one.deviation[part]
+    of_selection = (_SELECTED * np.linalg.norm(left)) ** 2 * np.eye(len(left))
+    covariance = one.covariance[part, part] + of_selection
+    consistent = _values(quantity, left, covariance, configured, len(estimated.b))
     evidence = replace(consistent.evidence, sigmas=one.certainty, shift=one.shift)
     found = replace(consistent, state=state, why=Why.OFF, evidence=evidence, candidates=candidates)
     assert found.estimate is not None
@@ -439,12 +460,18 @@ def _fault_findings(
     if quantity.code is Code.TIME_OFFSET:
         settings |= _equivalent_row(one, configured)
     yield replace(found, settings=settings)
-    if (
-        quantity.code is Code.DISTORTION
-        and found.active
-        and abs(found.estimate) < _LITTLE_OF * abs(found.active)
-    ):
+    if quantity.code is Code.DISTORTION and _hardly_distorted(found, configured.camera):
         yield Finding(Code.IMAGE_GEOMETRY, state, Why.RECTIFIED, parent=Code.DISTORTION)
+
+
+def _hardly_distorted(found: Finding, camera: RollingShutterCamera) -> bool:
+    """Whether the image's corner is displaced by a small part of what is configured."""
+    by_coefficients = displacements([corner_radius(camera)])[0]
+    estimated, active = (
+        abs(float(by_coefficients @ coefficients))
+        for coefficients in (found.estimated, found.configured)
+    )
+    return estimated < _LITTLE_OF * active
 
 
 def _setting(found: Finding, left: Array, configured: Configured) -> dict[str, Any]:
@@ -457,6 +484,11 @@ def _setting(found: Finding, left: Array, configured: Configured) -> dict[str, A
         return {'gyro_bias': findings.rounded(found.estimated)}
     if found.code in (Code.TIME_OFFSET, Code.READOUT_TIME):
         return {found.code.value: found.estimate}
+    if found.code is Code.DISTORTION:
+        camera = configured.camera
+        change = np.subtract(found.estimated, found.configured)
+        right = camera.moved_lens(np.concatenate([[0.0, 0.0], change, [0.0, 0.0]]))
+        return {'distortion_coefficients': findings.rounded(right.distortion)}
     return {}
 
 
@@ -472,31 +504,31 @@ def _tracking(quantity: Quantity, estimated: float, configured: Configured) -> d
 
 def _equivalent_row(one: Inconsistency, configured: Configured) -> dict[str, Any]:
     """Another stamped row that is equivalent to the deviation of the time offset."""
-    camera, sigma = configured.camera, one.sigma[LIVE.index('time_offset')]
+    camera, offset_at = configured.camera, LIVE.index('time_offset')
+    deviation, sigma = one.deviation[offset_at], math.sqrt(one.covariance[offset_at, offset_at])
     for row in REFERENCE_ROWS:
         index = replace(camera, reference_row=row).reference_row_index
         offset = camera.line_delay * (camera.reference_row_index - index)
-        if row != camera.reference_row and (
-            abs(one.deviation[LIVE.index('time_offset')] - offset) < 2.0 * sigma
-        ):
+        if row != camera.reference_row and (abs(deviation - offset) < 2.0 * sigma):
             return {'stamp_row': row}
     return {}
 
 
 def _values(
-    quantity: Quantity,
-    left: Array,
-    sigmas: Array,
-    configured: Configured,
-    calibration: Calibration,
+    quantity: Quantity, left: Array, covariance: Array, configured: Configured, pairs: int
 ) -> Finding:
     """A consistent finding with the values of a quantity.
 
-    `left`: deviation from the active values; of a vector, the most certain component is reported.
+    `left` (m,) with its `covariance` (m, m) is the deviation from the active values; of a vector,
+    the most certain component is reported.
     """
+    if quantity.shapes is not None:
+        shapes = quantity.shapes(configured)
+        left, covariance = shapes @ left, shapes @ covariance @ shapes.T
+    sigmas = np.sqrt(np.diag(covariance))
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma = float(sigmas[worst])
-    evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=len(calibration.b))
+    evidence = Evidence(sigmas=abs(float(left[worst])) / sigma, pairs=pairs)
     active = np.atleast_1d(quantity.value(configured, np.zeros(len(left))))
     estimated = np.atleast_1d(quantity.value(configured, left))
     return Finding(

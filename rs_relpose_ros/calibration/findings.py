@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.radial import corner_radius, displacements, independent_shapes
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -26,6 +27,13 @@ LARGEST_OFFSET = 0.05
 # Largest change of the readout time that tracking applies [s]. A larger one means another mode of
 # the camera. [chosen: a third of a usual readout time]
 LARGEST_READOUT = 0.01
+
+
+# Largest sigma of the displacement of the image's corner, over its radius, with which distortion
+# counts as observable. A larger one would report distortion that nothing determines but its prior
+# of 2 %, a smaller one would not report that of weak motion.
+# [chosen: 0.05 of k1 in an image of 640x480 with a focal length of 500 px]
+_OBSERVABLE_DISPLACEMENT = 0.03
 
 
 class FindingState(str, Enum):
@@ -287,7 +295,7 @@ class Quantity(NamedTuple):
 
     code: Code
     entry: str  # name of its deviation in `LIVE`
-    observable: float  # largest sigma with which the deviation counts as observable
+    observable: float  # largest `uncertainty` with which the deviation counts as observable
     # Unit of the values of a finding. Deviations are in rad where this is deg.
     unit: str
     shown: Shown
@@ -299,6 +307,13 @@ class Quantity(NamedTuple):
     relative: float = 0.0
     # Whether it is off alone, if at all: with others free it could cancel their effect.
     alone: bool = False
+    # Shapes (m, m) of a lens whose deviation is not that of its coefficients: coefficients by the
+    # deviation. Then `value` takes the change of the coefficients.
+    shapes: Callable[[Configured], Array] | None = None
+    # Size of the sigmas, by the covariance (m, m) of the deviation.
+    uncertainty: Callable[[Configured, Array], float] = lambda configured, covariance: math.sqrt(
+        float(np.diag(covariance).max())
+    )
     tracking: str = ''  # name of the parameter that lets the node track the quantity
     reach: float = 0.0  # largest deviation that tracking applies
 
@@ -328,8 +343,19 @@ def _focal_length(configured: Configured, left: Array) -> Array:
     return np.asarray(configured.camera.fx * np.exp(left))
 
 
-def _first_coefficient(configured: Configured, left: Array) -> Array:
-    return np.asarray((*configured.camera.distortion, 0.0)[0] + left)
+def _coefficients(configured: Configured, left: Array) -> Array:
+    return np.asarray(configured.camera.radial_coefficients + left)
+
+
+def _coefficient_shapes(configured: Configured) -> Array:
+    return independent_shapes(corner_radius(configured.camera))
+
+
+def _corner_sigma(configured: Configured, covariance: Array) -> float:
+    """1 sigma of the displacement of the image's corner, over its radius."""
+    radius = corner_radius(configured.camera)
+    by_values = displacements([radius])[0] @ independent_shapes(radius)
+    return math.sqrt(by_values @ covariance @ by_values)
 
 
 def _principal_point(configured: Configured, left: Array) -> Array:
@@ -429,10 +455,18 @@ QUANTITIES = (
     Quantity(
         Code.DISTORTION,
         'distortion',
-        0.05,
+        _OBSERVABLE_DISPLACEMENT,
         '',
-        Shown('', 1.0, 3, 'first coefficient: ' + COMPARED, 'calibrate the lens'),
-        _first_coefficient,
+        Shown(
+            '',
+            1.0,
+            3,
+            'k1, k2, k3: ' + COMPARED,
+            'set distortion_coefficients: {} with the camera_matrix, or calibrate the lens',
+        ),
+        _coefficients,
+        shapes=_coefficient_shapes,
+        uncertainty=_corner_sigma,
     ),
     Quantity(
         Code.PRINCIPAL_POINT,

@@ -5,13 +5,12 @@ them is no doubt any more; the rest is in the covariance of all parameters.
 """
 
 from enum import Enum
-import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rs_relpose_ros.calibration import model
 from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.core.radial import corner_radius, prior_covariance
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -46,14 +45,6 @@ _CENTER_SIGMA = 0.015
 # 1 sigma of the first coefficient of the distortion of a lens of which nothing is known.
 # [chosen: wide lenses have -0.3]
 _RADIAL_SIGMA = 0.3
-# Shares of the radius of the image's corner at which the displacement by a lens has a prior. Three
-# make the prior of three coefficients complete. [derived: half of the radius, the edge, between]
-_PRIOR_RADII = np.array([0.5, 0.75, 1.0])
-# 1 sigma of the displacement there, over the radius, of a lens that is given as without distortion
-# or with one. A smaller one would hold k1 and k2 of two cameras that cancel at the edge, a larger
-# one leaves their sum undetermined. [measured: 1.5 % and 1.3 % at half of the radius, 1.7 % and
-# 1.3 % at the edge, of two cameras that are given as without distortion]
-_PRIOR_DISPLACEMENTS = np.array([0.01, 0.015, 0.02])
 # 1 sigma of the tangential coefficients p1 and p2, which no fit estimates. A larger one would
 # dominate the doubt of the axes. [chosen: what a calibration by a target leaves]
 TANGENTIAL_SIGMA = 5e-4
@@ -70,29 +61,16 @@ _BIAS_SIGMA = 0.03
 _SLOPE_SIGMA = 1.0
 
 
-def displacements(radii: ArrayLike) -> Array:
-    """Derivatives (N, 3) of the displacement at radii (N,), over the radius, by k1, k2, k3."""
-    squares = np.asarray(radii)[:, None] ** 2
-    return np.asarray(squares ** [1, 2, 3])
-
-
-def corner_radius(camera: RollingShutterCamera) -> float:
-    """Radius of the corner of the image, normalised by the focal length."""
-    return math.hypot(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-
-
 def distortion_prior(camera: RollingShutterCamera, *, given: bool) -> Array:
     """Covariance (3, 3) of k1, k2, k3 about those of a camera.
 
     It is on what the lens does to the image, since large coefficients may cancel each other.
     `given` is whether the camera is that of a CameraInfo, and not a guess.
     """
-    by_coefficients = displacements(corner_radius(camera) * _PRIOR_RADII)
-    scaled = np.linalg.solve(by_coefficients, np.diag(_PRIOR_DISPLACEMENTS))
-    covariance = scaled @ scaled.T
+    covariance = prior_covariance(corner_radius(camera))
     if not given:
         covariance[0, 0] += _RADIAL_SIGMA**2
-    return np.asarray(covariance)
+    return covariance
 
 
 def prior_information(

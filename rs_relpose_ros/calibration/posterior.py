@@ -148,12 +148,13 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     are too few matches, or if a fit far from the gyro's rotation diverges.
     """
     at = about - active
+    basis = LIVE.of_camera(pair.camera)
     pair = thinned(pair, at)
     problem = problem_of(pair)
     information = problem.rotation_information
     if np.count_nonzero(problem.valid) < PARAMETERS or information is None:
         return None
-    linear = _linearised(pair, problem, at)
+    linear = _linearised(pair, problem, at, basis)
     sigma = robust_scale(linear.residuals, LEAST_SIGMA, 0.0)
     weights = cauchy_weight((linear.residuals / (CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     normal = _normal_equations(linear, weights, information)
@@ -220,12 +221,13 @@ def misfit_of(pair: PairData, at: Array) -> Misfit | None:
 
     None if there are too few matches.
     """
+    basis = LIVE.of_camera(pair.camera)
     pair = replace(thinned(pair, at), R=pair.segment.rotation, t=np.full(3, np.nan))
     problem = problem_of(pair)
     information = problem.rotation_information
     if np.count_nonzero(problem.valid) < PARAMETERS or information is None:
         return None
-    linear = _linearised(pair, problem, at)
+    linear = _linearised(pair, problem, at, basis)
     return Misfit(linear.residuals, 0.5 * float(linear.theta @ information @ linear.theta))
 
 
@@ -263,11 +265,14 @@ def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -
     return FrameRows(views, times, states, moved)
 
 
-def _linearised(pair: PairData, problem: TwoViewProblem, at: Array) -> _Linearised:
-    """The pair fitted at deviations `at` (K,) from the active ones, and linearised there."""
+def _linearised(pair: PairData, problem: TwoViewProblem, at: Array, basis: Array) -> _Linearised:
+    """The pair fitted at deviations `at` (K,) from the active ones, and linearised there.
+
+    `basis` (D, K) is that of `LIVE` for the camera as configured: `pair` has the lens of `at`.
+    """
     share = middle_share(pair.camera)
-    basis = by_stamped_row(LIVE, share) * LIVE.scales(pair.camera.width)
-    of_images = by_stamped_row(IMAGES, share)
+    basis = by_stamped_row(LIVE, basis, share)
+    of_images = by_stamped_row(IMAGES, IMAGES.basis, share)
     turning = basis[:, :_LENS] @ at[:_LENS]  # the lens is in the camera already
     frames = [frame_rows(pair, problem, image, turning) for image in (0, 1)]
     observations = np.column_stack(
@@ -471,8 +476,7 @@ def _with_lens(camera: RollingShutterCamera, lens: tuple[float, ...]) -> Rolling
     """The camera with deviations of its lens, the last ones of `LIVE`."""
     if not any(lens):
         return camera
-    basis = LIVE.basis[LENS, _LENS:] * LIVE.scales(camera.width)[_LENS:]
-    return camera.moved_lens(basis @ lens)
+    return camera.moved_lens(LIVE.of_camera(camera)[LENS, _LENS:] @ lens)
 
 
 def middle_share(camera: RollingShutterCamera) -> float:

@@ -608,7 +608,7 @@ class IntrinsicsConfig(Settings):
         'relative uncertainty of the focal length', '', 1.0, deviation='focal_log'
     )
     distortion_sigma: float = _sigma(
-        'uncertainty of the first of distortion_coefficients', '', 10.0, deviation='distortion'
+        'uncertainty of the lens, as k1 that displaces as much', '', 10.0, deviation='distortion'
     )
     principal_point_sigma: float = _sigma(
         'uncertainty of the principal point',

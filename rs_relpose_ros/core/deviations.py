@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.core.least_squares import first_indices
+from rs_relpose_ros.core.radial import corner_radius, independent_shapes, WRONG_SIGMA
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 
 class Entry(NamedTuple):
@@ -54,9 +56,10 @@ ENTRIES = (
     Entry('focal_log', 1, '', 0.3, 0.45),
     # fy / fx.
     Entry('aspect', 1, '', 0.002, 0.01),
-    # Coefficients k1, k2, k3.
-    Entry('distortion', 3, '', 0.5, 0.6),
-    # [px] in the whole vector, in widths of the image where `Selection.scales` is applied.
+    # Coefficients k1, k2, k3 in the whole vector. Where `Selection.of_camera` is applied, values
+    # of `radial.independent_shapes`, of which the first one is k1 alone.
+    Entry('distortion', 3, '', WRONG_SIGMA, 0.6),
+    # [px] in the whole vector, in widths of the image where `Selection.of_camera` is applied.
     Entry('principal_point', 2, 'width', 0.015, 0.1),
 )
 
@@ -128,13 +131,13 @@ class Selection:
             raise ValueError(f'{name} has more than one value')
         return int(part.start)
 
-    def scales(self, width: int) -> Array:
-        """Factors (k,) from values in the units of `ENTRIES` to the whole vector: a width [px]."""
-        units = {entry.name: width if entry.unit == 'width' else 1 for entry in ENTRIES}
-        scales = np.ones(self.size)
-        for name, part in self.parts.items():
-            scales[part] = units[name]
-        return scales
+    def of_camera(self, camera: RollingShutterCamera) -> Array:
+        """Basis (N_DEVIATIONS, k) of values in units of a camera: see `ENTRIES`."""
+        basis = self.basis.copy()
+        center, distortion = PARTS['principal_point'], PARTS['distortion']
+        basis[center] *= camera.width
+        basis[distortion] = independent_shapes(corner_radius(camera)) @ basis[distortion]
+        return basis
 
     def mask(self, *names: str) -> NDArray[np.bool_]:
         """Which of the values (k,) belong to these entries."""
@@ -152,9 +155,9 @@ LIVE = Selection.of(
     'readout_time',
     'gyro_bias',
     'focal_log',
+    'distortion',
     'principal_point',
     gyro_scale=COMMON,
-    distortion=FIRST,
 )
 # Deviations of the calibration of a recording: all. Those that it does not estimate are doubts.
 OFFLINE = Selection.of(*PARTS)
@@ -168,11 +171,12 @@ def by_name(**values: float) -> Array:
     return whole
 
 
-def by_stamped_row(selection: Selection, share: float) -> Array:
+def by_stamped_row(selection: Selection, basis: Array, share: float) -> Array:
     """Basis (N_DEVIATIONS, k) of a selection whose `time_offset` is that of the stamped row.
 
-    The middle row is read `share` of the readout after the stamped row, and so are its deviations.
+    `basis` is that of the selection with the offset of the middle row, which is read `share` of
+    the readout after the stamped row, and so are its deviations.
     """
-    basis = selection.basis.copy()
+    basis = basis.copy()
     basis[PARTS['time_offset'], selection.part('readout_time')] = share
     return basis

@@ -458,7 +458,7 @@ def _changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
     if problem.gyro is None or problem.R_cam_imu is None:
         return None
     camera = problem.camera
-    basis = selection.basis * selection.scales(camera.width)
+    basis = selection.of_camera(camera)
     pixels = _within_image(camera, problem.matches.points)
     views, count = pixels.shape[:2]
     rows = camera.rows_of(pixels)

@@ -430,7 +430,7 @@ class Pipeline(Processor[PairResult]):
             _with_step(parameters.sensor, self.applied.stepped),
             sensor.camera,
             bias,
-            configured_sigmas(parameters, from_reference, sensor.camera.width, offset_sigma),
+            configured_sigmas(parameters, from_reference, sensor.camera, offset_sigma),
             np.zeros(LIVE.size),
         )
         configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
