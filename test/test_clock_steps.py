@@ -7,10 +7,11 @@ import pytest
 from test_monitor import CONFIGURED
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration import assessment
 from rs_relpose_ros.calibration.assessment import unexplained
+from rs_relpose_ros.calibration.changes import change_of, drift_doubts, Kind
 from rs_relpose_ros.calibration.findings import Code, FindingState, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import line
-from rs_relpose_ros.calibration.offset_changes import Kind, offset_change
 from rs_relpose_ros.calibration.posterior import Calibration
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.core.deviations import LIVE
@@ -75,10 +76,10 @@ STAMPS_NS = np.arange(PAIRS, dtype=np.int64) * 170_000_000
 SECONDS = STAMPS_NS * 1e-9
 
 
-def calibration_of(offsets, seed=3, noise=0.002):
-    """Pairs whose time offsets deviate by `offsets` (N,) [s], each with a `noise` [s]."""
+def calibration_of(offsets, seed=3, noise=0.002, entry='time_offset'):
+    """Pairs whose `entry`, a time [s], deviates by `offsets` (N,), each with a `noise`."""
     rng = np.random.default_rng(seed)
-    k = LIVE.index('time_offset')
+    k = LIVE.index(entry)
     rows = rng.standard_normal((PAIRS, 20, LIVE.size)) / LIVE.sigmas
     rows[:, :, k] = rng.standard_normal((PAIRS, 20)) / (noise * np.sqrt(20.0))
     S = rows.transpose(0, 2, 1) @ rows
@@ -91,11 +92,15 @@ def calibration_of(offsets, seed=3, noise=0.002):
     )
 
 
+def change_by(pairs):
+    ranked = assessment.hypotheses(pairs, CONFIGURED)
+    return change_of(ranked, STAMPS_NS, CONFIGURED)
+
+
 @pytest.mark.parametrize(('step', 'first'), [(0.0031, 50), (-0.0044, 21)])
 def test_a_small_step_is_located(step, first):
-    found = offset_change(
-        calibration_of(np.where(np.arange(PAIRS) < first, 0.0, step)), STAMPS_NS, CONFIGURED
-    )
+    found = change_by(calibration_of(np.where(np.arange(PAIRS) < first, 0.0, step)))
+    assert found.entry == 'time_offset'
     assert found.kind is Kind.STEP
     assert found.value == pytest.approx(step, abs=4.0 * found.sigma)
     assert found.sigma < 7e-4
@@ -106,17 +111,44 @@ def test_a_small_step_is_located(step, first):
 @pytest.mark.parametrize('rate', [310e-6, -450e-6])
 def test_a_drift_is_measured(rate):
     pairs = calibration_of(rate * (SECONDS - 2.0), noise=7e-4)
-    found = offset_change(pairs, STAMPS_NS, CONFIGURED)
-    assert found.kind is Kind.DRIFT
+    found = change_by(pairs)
+    assert found.is_drift_of('time_offset')
     assert found.value == pytest.approx(rate, abs=4.0 * found.sigma)
     assert found.now == pytest.approx(rate * (SECONDS[-1] - 2.0), abs=1.5e-3)
+
+
+@pytest.mark.parametrize('rate', [0.0021, -0.0013])
+def test_a_zoom_is_measured(rate):
+    deviations = rate * (SECONDS - 9.0)
+    pairs = calibration_of(deviations, noise=0.006, entry='focal_log')
+    found = change_by(pairs)
+    assert found.is_drift_of('focal_log')
+    assert found.value == pytest.approx(rate, abs=4.0 * found.sigma)
+    assert found.now == pytest.approx(deviations[-1], abs=4.0 * found.now_sigma)
+    # Even while the focal length is right in the mean, that of now is in doubt.
+    ranked = assessment.hypotheses(pairs, CONFIGURED)
+    doubt = assessment.undetermined(pairs, CONFIGURED, drift_doubts(ranked, STAMPS_NS, CONFIGURED))
+    k = LIVE.index('focal_log')
+    assert np.sqrt(doubt[k, k]) > 0.7 * abs(deviations[-1])
+
+
+@pytest.mark.parametrize('value', [0.0, 0.02])
+@pytest.mark.parametrize('seed', range(5))
+def test_a_constant_focal_length_is_no_change(value, seed):
+    pairs = calibration_of(np.full(PAIRS, value), seed, 0.01, 'focal_log')
+    assert change_by(pairs) is None
+    ranked = assessment.hypotheses(pairs, CONFIGURED)
+    doubt = assessment.undetermined(pairs, CONFIGURED, drift_doubts(ranked, STAMPS_NS, CONFIGURED))
+    alone = assessment.undetermined(pairs, CONFIGURED)
+    k = LIVE.index('focal_log')
+    assert doubt[k, k] < 1.1 * alone[k, k]
 
 
 @pytest.mark.parametrize('offset', [0.0, 0.005])
 @pytest.mark.parametrize('seed', range(5))
 def test_a_constant_offset_is_no_change(offset, seed):
     pairs = calibration_of(np.full(PAIRS, offset), seed)
-    assert offset_change(pairs, STAMPS_NS, CONFIGURED) is None
+    assert change_by(pairs) is None
 
 
 @pytest.mark.parametrize(('noise', 'named'), [(1.0, False), (1.2, False), (2.0, True)])

@@ -21,10 +21,10 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 # commit that raises it. [chosen: 105 modules in 15 folders were found without a map;
 # since then own readers of bag files, with their index and decoding, and nine formats of
 # recordings have modules, one a purpose, the odometry has noise, factors, starts and publication
-# in modules of their own, times of bursts, steps of a clock and changes of the offset have one
-# each, the prior of radial coefficients has one for live and offline use,
+# in modules of their own, times of bursts, steps of a clock, changes of a deviation and objects
+# in the view have one each, the prior of radial coefficients has one for live and offline use,
 # and the report is a folder, as it is made of check, replay and odometry together]
-MOST_MODULES = 165
+MOST_MODULES = 166
 MOST_FOLDERS = 18
 # A module below this length that only one other imports belongs into that one.
 # [chosen: any value in 60..100 finds the same modules]

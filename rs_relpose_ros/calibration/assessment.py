@@ -6,7 +6,7 @@ sigma of a correctly configured pose, *wrong* if it moves the pose out of its co
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 import math
 from typing import Any, NamedTuple
@@ -157,24 +157,30 @@ class Inconsistency(NamedTuple):
 
 
 def find_inconsistencies(
-    estimated: Calibration, effects: Sequence[Effect], configured: Configured
+    estimated: Calibration,
+    effects: Sequence[Effect],
+    configured: Configured,
+    ranked: Sequence[Hypothesis] | None = None,
 ) -> list[Inconsistency]:
     """The fewest deviations that fit the pairs, by forward selection; the strongest first.
 
     A fit of all quantities would distribute a deviation of one among all that few pairs cannot
     distinguish. An alternative hypothesis is kept if it fits as well as the only quantity.
+    `ranked`: the `hypotheses` of these pairs, if they are known.
     """
     found: list[tuple[Quantity, float]] = []
     alternative: Inconsistency | None = None
     selected = np.zeros(LIVE.size, dtype=bool)
     together = _solved(selected, estimated, configured)
     while len(found) < _MOST_QUANTITIES:
-        (quantity, solution), (second, other) = _ranked(
-            [quantity for quantity in findings.QUANTITIES if not selected[quantity.part].any()],
-            selected,
-            estimated,
-            configured,
-        )[:2]
+        if selected.any() or ranked is None:
+            ranked = _ranked(
+                [one for one in findings.QUANTITIES if not selected[one.part].any()],
+                selected,
+                estimated,
+                configured,
+            )
+        (quantity, solution), (second, other) = ranked[:2]
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
         needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
@@ -190,27 +196,45 @@ def find_inconsistencies(
     return [inconsistent[0]._replace(alternative=alternative)] if len(found) == 1 else inconsistent
 
 
+class Hypothesis(NamedTuple):
+    """That one quantity is off, with the deviations that fit the pairs then."""
+
+    quantity: Quantity
+    solution: Solution
+
+    @property
+    def gain(self) -> float:
+        """In chi-square."""
+        return self.solution.gain(self.quantity.part)
+
+
+def hypotheses(estimated: Calibration, configured: Configured) -> list[Hypothesis]:
+    """One for each quantity, that it is off and no other one; the best first."""
+    none = np.zeros(LIVE.size, dtype=bool)
+    return _ranked(findings.QUANTITIES, none, estimated, configured)
+
+
 def _ranked(
     quantities: Sequence[Quantity],
     selected: NDArray[np.bool_],
     estimated: Calibration,
     configured: Configured,
-) -> list[tuple[Quantity, Solution]]:
+) -> list[Hypothesis]:
     """Hypotheses that free one more quantity each.
 
     Those that are certain come first, and of these the one with most evidence.
     """
 
-    def rank(hypothesis: tuple[Quantity, Solution]) -> tuple[bool, float]:
+    def rank(hypothesis: Hypothesis) -> tuple[bool, float]:
         quantity, solution = hypothesis
         is_certain = solution.certainty(quantity.part) >= _CERTAIN
         return not is_certain, -solution.evidence(quantity)
 
-    hypotheses = [
-        (quantity, _solved(selected | _parts_of(quantity), estimated, configured))
+    unordered = [
+        Hypothesis(quantity, _solved(selected | _parts_of(quantity), estimated, configured))
         for quantity in quantities
     ]
-    return sorted(hypotheses, key=rank)
+    return sorted(unordered, key=rank)
 
 
 def likely(estimated: Calibration, configured: Configured) -> Array:
@@ -229,31 +253,24 @@ def likely(estimated: Calibration, configured: Configured) -> Array:
     )
 
 
-def offset_hypotheses(
-    estimated: Calibration, configured: Configured
-) -> tuple[Solution, Solution, float]:
-    """Solutions with a configured and with a free time offset, and the best other evidence.
-
-    That is the chi-square in favour of the other quantity that explains the pairs best.
-    """
-    none = np.zeros(LIVE.size, dtype=bool)
-    others = [one for one in findings.QUANTITIES if one.code is not Code.TIME_OFFSET]
-    best, solution = _ranked(others, none, estimated, configured)[0]
-    return (
-        _solved(none, estimated, configured),
-        _solved(LIVE.mask('time_offset'), estimated, configured),
-        solution.evidence(best),
-    )
+def constant(estimated: Calibration, configured: Configured) -> Solution:
+    """Deviations within configured sigmas alone."""
+    return _solved(np.zeros(LIVE.size, dtype=bool), estimated, configured)
 
 
-def undetermined(estimated: Calibration, configured: Configured) -> Array:
+def undetermined(
+    estimated: Calibration,
+    configured: Configured,
+    drifts: Iterable[tuple[float, Array]] = (),
+) -> Array:
     """Second moment (K, K) of undetected deviations.
 
     Those within configured sigmas exist for certain (the gyro bias is in the covariance of a pair
     already). Whether another quantity is off is not known: before the first pair the odds are
     even, and each quantity as likely. Consistent pairs lower the odds of a quantity as they lower
     its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995).
-    Unknown quantities may be off together, but those that are `alone`::
+    Unknown quantities may be off together, but those that are `alone`, and `drifts`, which are the
+    odds and the moment of each::
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
@@ -280,7 +297,11 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[LIVE.part('gyro_bias')] = within[:, LIVE.part('gyro_bias')] = 0.0
     others = share * _solved(together, estimated, configured).moment
-    return np.asarray(others + alone / (1.0 + odds) + (1.0 - share) * within)
+    moment = others + alone / (1.0 + odds) + (1.0 - share) * within
+    # A drift that explains chance differences must not make the others less likely.
+    for own_odds, of_drift in drifts:
+        moment += own_odds / (1.0 + odds + own_odds) * of_drift
+    return np.asarray(moment)
 
 
 def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
@@ -366,16 +387,31 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     return Solution(off, covariance, estimated, active)
 
 
+def off_now(
+    code: Code, deviation: float, sigma: float, effects: Sequence[Effect]
+) -> Inconsistency:
+    """A quantity of one value that changes, with its deviation at the last pair."""
+    quantity = findings.BY_CODE[code]
+    deviations, sigmas = np.zeros(LIVE.size), np.zeros(LIVE.size)
+    deviations[quantity.part], sigmas[quantity.part] = deviation, sigma
+    certainty = abs(deviation) / sigma
+    return Inconsistency(quantity, deviations, sigmas, certainty, *_shifts(deviations, effects))
+
+
+def _shifts(deviation: Array, effects: Sequence[Effect]) -> tuple[float, float]:
+    """Shift of the poses that a deviation (K,) moves most, and the median in published sigmas."""
+    if not effects:
+        return 0.0, 0.0
+    shifts = [np.linalg.norm(effect.shift @ deviation) for effect in effects]
+    claimed = [np.linalg.norm(effect.claimed_shift @ deviation) for effect in effects]
+    return float(np.quantile(shifts, _OBSERVABLE_IN)), float(np.quantile(claimed, 0.5))
+
+
 def _inconsistency(
     quantity: Quantity, solution: Solution, certainty: float, effects: Sequence[Effect]
 ) -> Inconsistency:
     deviation = np.where(_parts_of(quantity), solution.off, 0.0)
-    shift, claimed = (
-        float(np.quantile([np.linalg.norm(effect[k] @ deviation) for effect in effects], quantile))
-        if effects
-        else 0.0
-        for k, quantile in enumerate((_OBSERVABLE_IN, 0.5))
-    )
+    shift, claimed = _shifts(deviation, effects)
     step = solution.active + solution.off - solution.estimated.about  # of the linearisation
     covariance = solution.widened_covariance + np.diag((_REMAINS * step) ** 2)
     return Inconsistency(quantity, deviation, covariance, certainty, shift, claimed)

@@ -70,8 +70,10 @@ class Code(str, Enum):
     ACCEL_SCALE = 'accel_scale'
     REPEATED_IMAGES = 'repeated_images'
     STATIC_REGION = 'static_region'
+    MOVING_OBJECT = 'moving_object'
     OFFSET_STEP = 'offset_step'
     OFFSET_DRIFT = 'offset_drift'
+    FOCAL_DRIFT = 'focal_drift'
     UNKNOWN_CAUSE = 'unknown_cause'
     # Causes that the odometry names.
     GYRO_NOISE = 'gyro_noise'
@@ -121,8 +123,9 @@ class Why(str, Enum):
     NO_SPECIFIC_FORCE = 'no_specific_force'
     RECTIFIED = 'rectified'
     STILL = 'still'  # images or parts of them, though the camera turns
+    TWO_MOTIONS = 'two_motions'  # among the matches of a pair
     STEPPED = 'stepped'  # a clock was set while the sensors ran
-    DRIFTING = 'drifting'  # a clock runs at another rate
+    DRIFTING = 'drifting'  # a clock runs at another rate, or a lens zooms or focuses
     UNEXPLAINED = 'unexplained'  # pairs contradict each other, whatever parameter is changed
     # Gross errors: `is_gross`.
     GROSS = 'gross'
@@ -190,8 +193,17 @@ class Finding:
 
 
 # Causes that move other parameters before they are found. [derived: pairs across a change of the
-# offset, and pairs that no parameter explains, are no evidence of another parameter]
-_DISTURBING = frozenset({Code.OFFSET_STEP, Code.OFFSET_DRIFT, Code.UNKNOWN_CAUSE})
+# offset or of the lens, of an object, and those that no parameter explains, are no evidence of
+# another parameter]
+_DISTURBING = frozenset(
+    {
+        Code.OFFSET_STEP,
+        Code.OFFSET_DRIFT,
+        Code.FOCAL_DRIFT,
+        Code.MOVING_OBJECT,
+        Code.UNKNOWN_CAUSE,
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)

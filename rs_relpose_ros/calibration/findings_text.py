@@ -296,6 +296,15 @@ def _static_region(finding: Finding) -> Text:
     )
 
 
+def _moving_object(finding: Finding) -> Text:
+    share = 100.0 * finding.evidence.measured['share_of_matches']
+    return Text(
+        f'a moving object fills much of the view: {share:.0f} % of the matches have a second '
+        'motion, and images and gyro contradict each other; poses are withheld',
+        'point the camera at a scene at rest, or mask what moves with the camera or before it',
+    )
+
+
 def _offset_step(finding: Finding) -> Text:
     step = with_sigma(Code.TIME_OFFSET, finding.estimated, finding.sigma or 0.0)
     measured = finding.evidence.measured
@@ -316,6 +325,16 @@ def _offset_drift(finding: Finding) -> Text:
         f'the time offset between camera and IMU drifts by {rate:.0f} +- {sigma:.0f} ppm: it is '
         'followed from now on',
         'have both sensors stamped by one clock',
+    )
+
+
+def _focal_drift(finding: Finding) -> Text:
+    assert finding.estimate is not None and finding.sigma is not None
+    rate, sigma = 100.0 * finding.estimate, 100.0 * finding.sigma
+    return Text(
+        f'the focal length changes by {rate:.3f} +- {sigma:.3f} % in a second: the lens zooms, or '
+        'its focus follows the scene',
+        'fix zoom and focus, and calibrate the camera with them',
     )
 
 
@@ -355,8 +374,10 @@ def _knock(finding: Finding) -> Text:
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,
+    (Code.MOVING_OBJECT, Why.TWO_MOTIONS): _moving_object,
     (Code.OFFSET_STEP, Why.STEPPED): _offset_step,
     (Code.OFFSET_DRIFT, Why.DRIFTING): _offset_drift,
+    (Code.FOCAL_DRIFT, Why.DRIFTING): _focal_drift,
     (Code.UNKNOWN_CAUSE, Why.UNEXPLAINED): _unknown_cause,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,

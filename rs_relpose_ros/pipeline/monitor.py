@@ -13,6 +13,7 @@ from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
 from rs_relpose_ros.calibration.assessment import Effect, Inconsistency
+from rs_relpose_ros.calibration.changes import Change, change_of, drift_doubts, Kind
 from rs_relpose_ros.calibration.clock_steps import ClockStep, ClockSteps
 from rs_relpose_ros.calibration.findings import (
     Assessment,
@@ -23,10 +24,10 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
-from rs_relpose_ros.calibration.offset_changes import Kind, offset_change, OffsetChange
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
 from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
+from rs_relpose_ros.calibration.second_motion import SecondMotions
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
@@ -87,9 +88,10 @@ class ConsistencyMonitor:
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self.clock_steps = ClockSteps()
+        self._second_motions = SecondMotions()
         self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
         self._drift: Finding | None = None  # that is followed
-        self.offset_change: OffsetChange | None = None  # by the pairs so far, not followed yet
+        self.change: Change | None = None  # by the pairs so far, not followed yet
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False  # by the last pair
@@ -102,6 +104,18 @@ class ConsistencyMonitor:
         # Velocities of a wrong configuration are no evidence.
         if not self._wrong_configuration:
             self.acceleration.add(stamp_ns, evidence)
+
+    def follows_object(self, data: posterior.PairData, pose: RelativePose) -> bool:
+        """Whether a pair may follow a moving object: then it is no evidence, and has no pose.
+
+        `pose` is that of the images, also if it contradicts the gyro.
+        """
+        was_in_view = self._second_motions.in_view
+        follows = self._second_motions.add(data, pose)
+        if self._second_motions.in_view and not was_in_view:
+            # Pairs before may have followed it, too.
+            self.restart()
+        return follows
 
     def add_pair(
         self,
@@ -185,24 +199,17 @@ class ConsistencyMonitor:
                     self.calibration = self._recursion.solved()
                 (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
                 # A deviation may be so large that no pair has a pose.
-                self._inconsistent = assessment.find_inconsistencies(
-                    self.calibration, self._on_poses or self._on_rotations, configured
-                )
-                # Pairs that contradict each other would show a change by chance.
-                self.offset_change = (
-                    None
-                    if assessment.unexplained(self.calibration)
-                    else offset_change(self.calibration, self._recursion.stamps_ns, configured)
-                )
-                self._likely = (
-                    self._deviation()
-                    if self._inconsistent
-                    else assessment.likely(self.calibration, configured)
-                )
+                self._find_inconsistencies(configured)
             except np.linalg.LinAlgError:
                 self._inconsistent = []
-            self._undetermined = assessment.undetermined(self.calibration, configured)
             self._compare_directions(due)
+        if self._second_motions.in_view:
+            # Rotations by the images are those of the object.
+            self.rotations.clear()
+            found_object = self._second_motions.finding()
+            others = assessment.not_evaluated(set(), found_object.code)
+            self.health = Assessment((found_object, *others, *self.image_findings))
+            return
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
         ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
         self._gross = assessment.gross_errors(
@@ -223,6 +230,32 @@ class ConsistencyMonitor:
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
+
+    def _find_inconsistencies(self, configured: Configured) -> None:
+        """Find which quantities are off, or change, by all pairs so far."""
+        estimated, stamps_ns = self.calibration, self._recursion.stamps_ns
+        effects = self._on_poses or self._on_rotations
+        ranked = assessment.hypotheses(estimated, configured)
+        self._undetermined = assessment.undetermined(
+            estimated, configured, drift_doubts(ranked, stamps_ns, configured)
+        )
+        # Pairs that contradict each other would show a change by chance.
+        self.change = (
+            None
+            if assessment.unexplained(estimated)
+            else change_of(ranked, stamps_ns, configured, self.change)
+        )
+        if self.change is not None and self.change.is_drift_of('focal_log'):
+            # It is not followed: what matters is the focal length of now.
+            now, sigma = self.change.now, self.change.now_sigma
+            self._inconsistent = [assessment.off_now(Code.FOCAL_LENGTH, now, sigma, effects)]
+        else:
+            self._inconsistent = assessment.find_inconsistencies(
+                estimated, effects, configured, ranked
+            )
+        self._likely = (
+            self._deviation() if self._inconsistent else assessment.likely(estimated, configured)
+        )
 
     def _test_without_cause(self) -> None:
         """Report that the pairs contradict each other, in place of a cause that does not fit."""
@@ -257,13 +290,13 @@ class ConsistencyMonitor:
                 self._recursion.add(pair.stamp_ns, at_step, configured.active, configured.active)
         self.calibration = self._recursion.solved()
 
-    def follow_change(self, change: OffsetChange, drift: float) -> None:
+    def follow_change(self, change: Change, drift: float) -> None:
         """Go on after a small step or with a drift of the time offset, which is then `drift`.
 
         The pairs are referred to the configuration that follows the change.
         """
         stamps_ns = self._recursion.stamps_ns
-        begin_ns, end_ns = change.between_ns
+        _, end_ns = change.between_ns
         offsets, first = np.full(len(stamps_ns), change.now), 0
         if change.kind is Kind.STEP:
             first = int(np.searchsorted(stamps_ns, end_ns))
@@ -273,29 +306,20 @@ class ConsistencyMonitor:
             self._step = end_ns, found
         else:
             offsets += change.value * (stamps_ns - end_ns) / NANOSECONDS
-            evidence = Evidence(
-                pairs=change.pairs,
-                log_likelihood=change.gain,
-                measured={'first_ns': begin_ns, 'last_ns': end_ns},
-            )
-            self._drift = Finding(
-                Code.OFFSET_DRIFT,
-                FindingState.SUSPECT,
-                Why.DRIFTING,
-                estimated=(drift,),
-                sigma=change.sigma,
-                unit='s/s',
-                evidence=evidence,
-            )
+            self._drift = _finding_of_drift(Code.OFFSET_DRIFT, change, drift, 's/s')
         self._recursion.follow_offsets(offsets, first)
         self.calibration = self._recursion.solved()
-        self._inconsistent, self.offset_change = [], None
+        self._inconsistent, self.change = [], None
         self._likely, self._undetermined = np.zeros(LIVE.size), None
         self._due = None
 
     def _of_changes(self, stamp_ns: int) -> tuple[Finding, ...]:
         """Findings on a drift, and on the last step for some seconds after its trial."""
         found = () if self._drift is None else (self._drift,)
+        change = self.change
+        if change is not None and change.is_drift_of('focal_log'):
+            zoom = _finding_of_drift(Code.FOCAL_DRIFT, change, change.value, '1/s')
+            found = (*found, zoom)
         if self._step is None or self.clock_steps.on_trial:
             return found
         end_ns, step = self._step
@@ -310,7 +334,7 @@ class ConsistencyMonitor:
         self.clock_steps.end_doubt()
         self._inconsistent, self._gross = [], ()
         self._likely, self._undetermined = np.zeros(LIVE.size), None
-        self._due = self.latest = self._step = self.offset_change = None
+        self._due = self.latest = self._step = self.change = None
         self.calibration = posterior.NOTHING_ESTIMATED
 
     def _compare_directions(self, due: _Due) -> None:
@@ -341,6 +365,24 @@ def _finding_of_step(
             log_likelihood=gain,
             measured={'before_ns': before_ns, 'after_ns': after_ns},
         ),
+    )
+
+
+def _finding_of_drift(code: Code, change: Change, rate: float, unit: str) -> Finding:
+    begin_ns, end_ns = change.between_ns
+    evidence = Evidence(
+        pairs=change.pairs,
+        log_likelihood=change.gain,
+        measured={'first_ns': begin_ns, 'last_ns': end_ns},
+    )
+    return Finding(
+        code,
+        FindingState.SUSPECT,
+        Why.DRIFTING,
+        estimated=(rate,),
+        sigma=change.sigma,
+        unit=unit,
+        evidence=evidence,
     )
 
 
@@ -513,7 +555,7 @@ class Applied:
             stepped_variance=max(self.stepped_variance + variance, 0.0),
         )
 
-    def after_change(self, change: OffsetChange, stamp_ns: int) -> Applied:
+    def after_change(self, change: Change, stamp_ns: int) -> Applied:
         """The corrections at a stamp after a small step, or with a drift."""
         if change.kind is Kind.STEP:
             return self.after_step(change.now, change.sigma**2)

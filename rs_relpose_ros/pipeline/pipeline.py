@@ -63,6 +63,10 @@ _UNMATCHED_PERIOD = 0.5
 _STEP_SOUGHT = (
     'images and gyro contradict each other, other than before: a step of a clock is looked for'
 )
+# Reason for a pair that may follow an object. [derived: text for people]
+_TWO_MOTIONS = (
+    'the matches have two motions, and the images contradict the gyro: an object moves in the view'
+)
 # Reason for a pair without the accelerometer. [derived: text for people]
 _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
@@ -354,6 +358,9 @@ class Pipeline(Processor[PairResult]):
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
+        follows_object = data is not None and monitor.follows_object(data, fitted)
+        if follows_object:
+            data = None
         configured = self._configured(
             frame.applied_offset_ns, frame.imu_doubt.common, since, sensor, parameters
         )
@@ -366,6 +373,8 @@ class Pipeline(Processor[PairResult]):
             pose = suppressed(pose, monitor.health)
             if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
+            if follows_object:
+                pose = withheld(pose, _TWO_MOTIONS)
         self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured))
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         return replace(
@@ -390,7 +399,7 @@ class Pipeline(Processor[PairResult]):
         """Move the corrections of the next frames towards the estimates, or by a step."""
         monitor = self._monitor
         steps = monitor.clock_steps
-        change = monitor.offset_change
+        change = monitor.change
         self.applied = self.applied.at(stamp_ns)
         if (wrong := steps.refuted()) is not None:
             self.applied = self.applied.after_step(-wrong.seconds, -(wrong.sigma**2))
@@ -399,7 +408,7 @@ class Pipeline(Processor[PairResult]):
             self.applied = self.applied.after_step(step.seconds, step.sigma**2)
             sensor = _with_step(configured.sensor, step.seconds)
             monitor.follow_step(step, validate.replaced(configured, sensor=sensor))
-        elif change is not None and not steps.in_doubt:
+        elif change is not None and change.entry == 'time_offset' and not steps.in_doubt:
             self.applied = self.applied.after_change(change, stamp_ns)
             monitor.follow_change(change, self.applied.drift)
         else:

@@ -1,0 +1,75 @@
+"""An object that moves through the view: named, and its pairs are no evidence and have no pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_monitor import flight, NONE
+
+from rs_relpose_ros.calibration.findings import Code, FindingState
+from rs_relpose_ros.calibration.findings_text import line
+from rs_relpose_ros.calibration.second_motion import second_share, SecondMotions
+from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+
+NO_TURN = np.array([0.004, -0.003])  # 1 + a similarity's turn and scale
+
+
+def with_object(pair, share, shift, seed=4):
+    """A pair whose leftmost `share` of the matches are of an object that moves by `shift`."""
+    border = np.quantile(pair.points1[:, 0], share)
+    of_object = pair.points1[:, 0] < border
+    noise = np.random.default_rng(seed).normal(size=pair.points1.shape)
+    moved = pair.points1 + shift + 0.2 * noise
+    turned = moved + (moved - moved.mean(axis=0)) @ np.array([NO_TURN, NO_TURN[::-1] * (-1, 1)])
+    points2 = np.where(of_object[:, None], turned, pair.points2)
+    return replace(pair, points2=points2), of_object
+
+
+def pose_of(inliers, gyro_square):
+    return RelativePose(
+        status=Status.LOW_PARALLAX,
+        reason='',
+        inliers=inliers,
+        diagnostics=Diagnostics(gyro_square=gyro_square),
+    )
+
+
+@pytest.mark.parametrize('share', [0.25, 0.7])
+@pytest.mark.parametrize('follows', ['scene', 'object'])
+def test_the_share_of_an_object_is_counted(share, follows):
+    for pair in flight(NONE, 4):
+        shown, of_object = with_object(pair, share, (9.0, -4.0))
+        inliers = of_object if follows == 'object' else ~of_object
+        assert second_share(shown, inliers) == pytest.approx(of_object.mean(), abs=0.06)
+        assert second_share(pair, np.ones(len(inliers), dtype=bool)) == 0.0
+
+
+def test_matches_at_random_are_no_object():
+    rng = np.random.default_rng(8)
+    for pair in flight(NONE, 4):
+        wrong = rng.random(len(pair.points1)) < 0.4
+        points2 = pair.points2 + np.where(wrong[:, None], rng.normal(size=(len(wrong), 2)) * 30, 0)
+        assert second_share(replace(pair, points2=points2), ~wrong) == 0.0
+
+
+def test_an_object_is_in_view_from_the_fifth_pair_until_long_after_the_last():
+    motions = SecondMotions()
+    for k, pair in enumerate(flight(NONE, 5)):
+        shown, of_object = with_object(pair, 0.5, (12.0, 3.0))
+        assert motions.add(shown, pose_of(of_object, np.nan))
+        assert motions.in_view is (k == 4)
+    found = motions.finding()
+    assert (found.code, found.state) == (Code.MOVING_OBJECT, FindingState.WRONG)
+    assert found.evidence.measured['share_of_matches'] == pytest.approx(0.5, abs=0.05)
+    assert 'a moving object fills much of the view' in line(found)
+    everything = pose_of(np.ones(len(pair.points1), dtype=bool), 1.0)
+    later = [motions.add(pair, everything) for _ in range(60)]
+    assert all(later[:30])
+    assert not any(later[45:])
+
+
+def test_a_scene_behind_an_object_that_agrees_with_the_gyro_keeps_its_poses():
+    motions = SecondMotions()
+    for pair in flight(NONE, 9):
+        shown, of_object = with_object(pair, 0.3, (12.0, 3.0))
+        assert not motions.add(shown, pose_of(~of_object, 2.0))
