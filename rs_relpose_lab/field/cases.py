@@ -30,6 +30,7 @@ BASES: dict[str, SimulationConfig] = {
     'blurred': SimulationConfig(
         seed=505, scene='hall', duration=18.0, plan='walk:18', exposure_time=0.033
     ),
+    'plane': SimulationConfig(seed=507, scene='wall', duration=18.0, plan='walk:18'),
     'fisheye': SimulationConfig(
         seed=506,
         scene='hall',
@@ -392,6 +393,14 @@ CASES: tuple[Case, ...] = (
         'light of mains flickers, the exposure jumps',
         partial(_D.flicker, strength=0.15),
         r'',
+    ),
+    Case(
+        'G12',
+        'a single plane fills the view, about five baselines away',
+        lambda one: one,
+        r'',
+        base='plane',
+        solvable=True,
     ),
     Case('G13', 'exposure as long as the frame interval', lambda one: one, r'', base='blurred'),
     Case('G14', 'a wide lens near its fold', lambda one: one, r'', base='fisheye', solvable=True),

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.simulation.motions import Plan
-from rs_relpose_lab.simulation.scene import SCENES
+from rs_relpose_lab.simulation.scene import ALL_SCENES
 from rs_relpose_ros.config.settings import setting, Settings
 from rs_relpose_ros.geometry import validate
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS, RollingShutterCamera
@@ -25,7 +25,9 @@ class SimulationConfig(Settings):
     duration: float = setting(6.0, 'length of the recording', 's', low=0.1, high=600.0)
     fps: float = setting(30.0, 'frames per second', 'Hz', low=1.0, high=240.0)
     seed: int = setting(0, 'seed of motion, scene and noise', low=0, high=2**31 - 1)
-    scene: str = setting('hall', 'kind of scene; its details come from the seed', choices=SCENES)
+    scene: str = setting(
+        'hall', 'kind of scene; its details come from the seed', choices=ALL_SCENES
+    )
     width: int = setting(640, 'image width', 'px', low=16, high=4096)
     height: int = setting(480, 'image height', 'px', low=16, high=4096)
     fx: float = setting(450.0, 'focal length of both axes', 'px', low=10.0, high=10_000.0)

@@ -145,6 +145,8 @@ def _fixed(coordinates: NDArray[np.float64]) -> NDArray[np.int32]:
 
 
 SCENES = ('hall', 'yard', 'gallery')
+# Those of walks, and a single plane that fills the view, which benchmarks of walks do not use.
+ALL_SCENES = (*SCENES, 'wall')
 
 # The camera stays within this distance of the origin's vertical [m].
 _ARENA = 3.5
@@ -221,14 +223,14 @@ def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scen
     """A scene around the origin, where the camera walks at eye height and looks along x.
 
     `kind`: closed 'hall' with crates and banners; 'yard' with house fronts, crates and sky; narrow
-        'gallery' with pictures and pillars.
+        'gallery' with pictures and pillars; a 'wall' that fills the view, about five steps away.
     `rng`: draws places, sizes and textures.
     `focal_length`: of the camera [px]: textures are as fine as it can see.
     """
-    if kind not in SCENES:
-        raise InputError(f'scene must be one of {SCENES}, got {kind!r}')
+    if kind not in ALL_SCENES:
+        raise InputError(f'scene must be one of {ALL_SCENES}, got {kind!r}')
     builder = _Builder(rng, focal_length)
-    build = {'hall': _hall, 'yard': _yard, 'gallery': _gallery}[kind]
+    build = {'hall': _hall, 'yard': _yard, 'gallery': _gallery, 'wall': _wall}[kind]
     return Scene.of(*(surface for surface in build(builder, rng) if surface is not None))
 
 
@@ -276,6 +278,11 @@ def _gallery(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | 
         y = rng.uniform(-3.5, 3.5)
         yield from builder.box((x, y, 2.1), (0.5, 0.5, 4.2), rng.uniform(0.0, 1.5))
     yield from _crates(builder, rng, count=5, reach=length - 2.0)
+
+
+def _wall(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | None]:
+    x = rng.uniform(5.0, 6.5)
+    yield builder.surface((x, 22.0, 12.0), (0, -1, 0), (0, 0, -1), 44.0, 21.0)
 
 
 def _crates(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag
 from rs_relpose_ros.bags.sensor_topics import SensorTopics
-from rs_relpose_ros.calibrate import following
+from rs_relpose_ros.calibrate import acceptance, following
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
 from rs_relpose_ros.calibration import (
     errors,
@@ -131,9 +131,10 @@ class Fitted(NamedTuple):
 def result_of(
     found: Fitted, config: CalibrationConfig, R_prior: Array | None
 ) -> CalibrationResult:
-    """Result of a fit, joined with the rotation of a transform."""
+    """Result of a fit, joined with the rotation of a transform, without values if it fails."""
     final, axes_known = _with_axes(found.data, found.final, R_prior)
-    return evaluated(found.data, final, found.curve, config, axes_known=axes_known)
+    result = evaluated(found.data, final, found.curve, config, axes_known=axes_known)
+    return acceptance.accepted(result, found.data, final)
 
 
 def fitted(
@@ -200,7 +201,11 @@ def _calibrated(
         free[model.SLOPE] = changed.stamps.covariates.any()
         return _fit_with_lens(about, changed, before.unknowns, free, _ALL_PAIRS, rng)
 
+    beyond = acceptance.contradiction(data, final)
+    if beyond > 1.0:
+        data, final = refitted(replace(data, doubt=beyond), final)
     data, final = following.followed(data, final, refitted, at_end=config.offset_at_end)
+    acceptance.refuse_stabilised(data, final.unknowns, data.pairs(_NEIGHBOURS, rng))
     progress(0.7)
     final = errors.widened(final, in_images=config.exposed)
     progress(0.8)
@@ -317,6 +322,7 @@ def _coarse_fit(
 
     With rows along the axis of the image that fits.
     """
+    acceptance.refuse_two_views(data)
     pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
@@ -324,10 +330,7 @@ def _coarse_fit(
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
             'Record with a short exposure in good light, and rotate more slowly'
         )
-    begins, ends = data.times[observations.frames_of(pairs)]
-    measured = observations.MeasuredRates(
-        data.image_rates(pairs), begins, ends, data.gyro_times, data.gyro_rates
-    )
+    measured = data.measured_rates(pairs)
     reach = config.max_time_offset + 0.02
     distant = observations.distant_offsets(measured, reach) if config.search_overlap else []
 
@@ -346,8 +349,7 @@ def _coarse_fit(
     tried = offset_course.tried_offsets(starts[0].offset)
     course = offset_course.proposed(observations.rates_at(measured, tried, starts[0]))
     if not course.is_constant:
-        shifts = course.at(0.5 * (begins + ends))
-        starts = starts_of(measured._replace(begins=begins + shifts, ends=ends + shifts)) or starts
+        starts = starts_of(data.following(course).measured_rates(pairs)) or starts
     fits = []
     for start in starts:
         lens = np.log(start.focal_factor) * np.eye(N_LENS)[0]
@@ -374,7 +376,7 @@ def _fit_with_lens(
     seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
     for _ in range(_LENS_ROUNDS):
         moved = about(data.lens + coarse.parameters[model.LENS])
-        data = moved.along(data.camera.readout_axis).following(data.course)
+        data = moved.like(data)
         problem = data.selected_problem(selection, offset, np.random.default_rng(seed))
         if found is not None and np.array_equal(problem.rows[0], found.problem.rows[0]):
             # The same matches: only the lens is linearised again.
@@ -548,7 +550,7 @@ def evaluated(
         offset_by_interval=None if jitters else slope,
         offset_by_jitter=slope if jitters else None,
         offset_changes=following.offset_changes(data, final, offset),
-        stamp_jitter=jitters * float(np.sqrt((data.stamps.covariates**2).mean())),
+        stamp_jitter=jitters * data.stamps.size,
         rotation_rates=rates,
         curve=curve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
@@ -617,12 +619,6 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     return fit.stepped(final.unknowns, gain @ off), covariance - gain @ own.T
 
 
-# Sigmas of a claim and of its estimate together beyond which images contradict the claim. Fewer
-# would contradict a right CameraInfo by chance, more would hide a wrong one.
-# [chosen: as other contradictions of a configuration]
-_CONTRADICTED = 4.0
-
-
 def _against_claims(data: Observations, parameters: Array, covariance: Array) -> str:
     """Name what the images contradict of the lens of a CameraInfo, with its value; '' if nothing.
 
@@ -632,6 +628,7 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
     coefficients = ', '.join(f'{one:.3f}' for one in camera.radial_coefficients)
     values = {
         'focal_log': f'a focal length of {camera.fx:.1f} px',
+        'aspect': f'focal lengths fx {camera.fx:.1f} and fy {camera.fy:.1f} px',
         'distortion': f'a distortion k1, k2, k3 of {coefficients}',
         'principal_point': f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px',
     }
@@ -645,7 +642,7 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
         own = off[part]
         gain = float(own @ np.linalg.solve(spread[part, part], own))
         # A vector gains more by chance.
-        if gain > _CONTRADICTED**2 + len(own) - 1:
+        if gain > acceptance.CONTRADICTED**2 + len(own) - 1:
             names.append(text)
     if not names:
         return ''
@@ -666,6 +663,9 @@ def _offset_of_row_0(
     value = float(by_parameters @ parameters)
     variance = float(by_parameters @ covariance @ by_parameters)
     sigma = math.hypot(math.sqrt(variance), following.sigma_over_recording(data))
+    if data.stamps.varying is observations.Varying.JITTER:
+        # The offset is for the stamps of single frames, which have this error.
+        sigma = math.hypot(sigma, data.stamps.size)
     unknown = ''
     if data.follows_intervals and not data.course.is_constant:
         unknown = 'a clock was set or drifts, and the offset varies with the intervals as well'
@@ -775,8 +775,8 @@ def _bounded(
     if abs(readout) - 3.0 * sigma > interval:
         raise InputError(
             f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
-            'no camera can do: check for frames that were dropped and stamped again, and for '
-            'images that were cropped, scaled or rotated'
+            'no camera can do: check for stabilised images (stabilisation), for frames that were '
+            'dropped and stamped again, and for images that were cropped, scaled or rotated'
         )
     # Of a truncated normal distribution; at least 0.1 % of it lies within.
     ends = (np.array([-interval, interval]) - readout) / sigma

@@ -101,6 +101,7 @@ class CalibrationResult:
     matches: int
     frame_interval: float  # median [s]
     warnings: tuple[str, ...] = ()
+    failure: str = ''  # why no value may be used; '' if they may
 
     @property
     def readout_direction(self) -> str:
@@ -324,6 +325,7 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
         *lines,
         'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
         *(f'note: {warning}' for warning in result.warnings),
+        *([f'NOT USABLE: {result.failure}'] if result.failure else []),
     ]
 
 
@@ -478,7 +480,7 @@ def _clock_parameters(result: CalibrationResult) -> list[_Parameter]:
             f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.'
         )
         values.append(('exposure_margin', round(margin, 5), source))
-    elif exposure.value > 2.0 * exposure.sigma:
+    elif exposure.determined and exposure.value > 2.0 * exposure.sigma:
         source = f'1 sigma {_MS * exposure.sigma:.1f} ms.'
         values.append(('exposure_time', round(exposure.value, 5), source))
     return values
@@ -533,6 +535,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         }
     return {
         'observable': result.observable,
+        'failure': result.failure,
         'holds_for': holds_for(result, camera),
         'shutter': result.shutter,
         'readout_time_s': asdict(result.readout_time),

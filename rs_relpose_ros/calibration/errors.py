@@ -159,7 +159,8 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
     """
     by_prior = _by_prior(final)
     of_noise = final.covariance - by_prior @ by_prior.T
-    wider = np.sqrt(_between_regions(final, of_noise) * _disagreement(final, of_noise))
+    of_halves, apart = _disagreement(final, of_noise)
+    wider = np.sqrt(_between_regions(final, of_noise) * of_halves)
     by_tangential = np.zeros((GLOBAL, 2))
     shared = 1.0
     if in_images:
@@ -167,7 +168,7 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
         shared += _SHARED**2 * final.problem.pairs
     by_doubt = np.hstack([by_prior, by_tangential])
     covariance = shared * of_noise * np.outer(wider, wider) + by_doubt @ by_doubt.T
-    return replace(final, covariance=covariance, by_doubt=by_doubt)
+    return replace(final, covariance=covariance, by_doubt=by_doubt, halves_apart=apart)
 
 
 def _by_prior(final: Fit) -> Array:
@@ -263,8 +264,10 @@ def _regions(points: Array) -> NDArray[np.int64]:
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
 
 
-def _disagreement(final: Fit, of_noise: Array) -> Array:
+def _disagreement(final: Fit, of_noise: Array) -> tuple[Array, float]:
     """Factors (GLOBAL,) of the variances by the difference of both halves; 1 if it is chance.
+
+    Also its mean square over the parameters, in sigmas.
 
     `of_noise` (GLOBAL, GLOBAL) is the covariance without the errors of the priors, which both
     halves share.
@@ -291,7 +294,7 @@ def _disagreement(final: Fit, of_noise: Array) -> Array:
     of_all = mean if mean > _CHANCE else 1.0
     factors = np.ones(GLOBAL)
     factors[free] = np.maximum(of_all, np.where(squares > _GROSS, squares, 1.0))
-    return factors
+    return factors, mean
 
 
 # -- Use of a calibration -------------------------------------------------------------------------

@@ -437,6 +437,8 @@ class Fit:
     left: Array
     # (GLOBAL, m) moves by one sigma of each doubt that the covariance contains.
     by_doubt: Array
+    # Mean squared difference, in sigmas, of the parameters of two halves; 0 before it is known.
+    halves_apart: float = 0.0
 
     @property
     def information(self) -> Array:

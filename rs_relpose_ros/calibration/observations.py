@@ -145,6 +145,11 @@ class FrameTimes(NamedTuple):
     # stamps jitter; those of an `OffsetCourse`; otherwise zero.
     covariates: Array
 
+    @property
+    def size(self) -> float:
+        """Rms of the covariates."""
+        return float(np.sqrt((self.covariates**2).mean()))
+
 
 def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     """Evaluate F stamps [ns]; at least two."""
@@ -274,6 +279,7 @@ class Observations:
     blur_rates: Array  # (K, 3) their derivative by its square [rad/s^3]
     gyro_density: float  # white noise of the gyro [rad/s/sqrt(Hz)]
     course: OffsetCourse = OffsetCourse()  # noqa: RUF009 it is frozen
+    doubt: float = 1.0  # factor of the sigmas of what is claimed of the lens
 
     @classmethod
     def of(
@@ -341,6 +347,11 @@ class Observations:
         """Stamps (F,) [s], from which one offset for all leads to the clock of the gyro."""
         return np.asarray(self.times + self.course.at(self.times))
 
+    def like(self, other: Observations) -> Observations:
+        """The same as `other` about this lens: rows, course of the offset and doubt."""
+        moved = self.along(other.camera.readout_axis).following(other.course)
+        return replace(moved, doubt=other.doubt)
+
     @property
     def interval(self) -> float:
         """Median interval between frames [s]."""
@@ -399,6 +410,13 @@ class Observations:
             pairs = [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, most)]
         return pairs
 
+    def measured_rates(self, pairs: Sequence[Pair]) -> MeasuredRates:
+        """Rates of P pairs and of the gyro, each on its clock, with the course of the offset."""
+        begins, ends = self.gyro_times_of_frames[frames_of(pairs)]
+        return MeasuredRates(
+            self.image_rates(pairs), begins, ends, self.gyro_times, self.gyro_rates
+        )
+
     def image_rates(self, pairs: Sequence[Pair]) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame, that rotates the rays of each pair."""
         rays, times = self.camera.unproject(self.tracks.points), self.times[frames_of(pairs)]
@@ -431,9 +449,16 @@ class Observations:
             of_pixels.by_pixel_by_lens.reshape(*pixels.shape, 2, N_LENS),
             np.full(len(pairs), _BEND_AT_START),
             turn_sigma,
-            prior_information(self.camera, self.knowledge, self.exposure.square_sigma),
+            self._prior(),
             center,
         )
+
+    def _prior(self) -> Array:
+        """Information (GLOBAL, GLOBAL) of the parameters before the fit."""
+        information = prior_information(self.camera, self.knowledge, self.exposure.square_sigma)
+        information[model.LENS] /= self.doubt
+        information[:, model.LENS] /= self.doubt
+        return information
 
 
 # -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------
@@ -554,7 +579,7 @@ def rates_at(measured_rates: MeasuredRates, offsets: Array, start: Start) -> Rat
     rates, begins, ends, gyro_times, gyro_rates = measured_rates
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
     lens = np.array([1.0 / start.focal_factor, 1.0 / start.focal_factor, 1.0])
-    order = np.argsort(begins + ends)
+    order = np.argsort(begins + ends, kind='stable')
     begins, ends = begins[order], ends[order]
     gyro = np.full((len(offsets), len(rates), 3), np.nan)
     for number, offset in enumerate(offsets):

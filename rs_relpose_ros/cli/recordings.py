@@ -72,7 +72,10 @@ def calibrate_bag(
     )
     mapping = calibration.as_mapping(result, recording.camera) | extra
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
-    for path, content in ((parameters, text), (metrics, json_text(mapping, indent=1))):
+    contents = {metrics: json_text(mapping, indent=1)}
+    if not result.failure:  # else there is no value for use
+        contents[parameters] = text
+    for path, content in contents.items():
         with written(path) as file:
             file.write(content)
     calibration.draw_curve(result, curve)
@@ -169,7 +172,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     result, camera = calibrate_bag(args)
     for line in calibration.report(result, camera):
         print(line)
-    print(f'in {options.out_folder(args, "calibration")}: {", ".join(_CALIBRATION_FILES)}')
+    names = _CALIBRATION_FILES[1:] if result.failure else _CALIBRATION_FILES
+    print(f'in {options.out_folder(args, "calibration")}: {", ".join(names)}')
     return 0 if result.complete else FAILED
 
 

@@ -1,0 +1,156 @@
+"""Recordings that the model of a calibration does not describe have no values for use."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
+from rs_relpose_ros.calibrate import acceptance
+from rs_relpose_ros.calibrate.procedure import calibrate
+from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
+from rs_relpose_ros.calibration.image_motion import gains, repeated_axis
+from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+
+
+def recorded(seed: int, **values: object) -> Recorded:
+    rng = np.random.default_rng(seed)
+    truth = drawn(rng, **({'readout_time': 0.02, 'frames': 240} | values))
+    return record(replace(truth, fps=30.0), rng)
+
+
+def camera_of(one: Recorded) -> RollingShutterCamera:
+    truth = one.truth
+    return RollingShutterCamera(
+        width=truth.width,
+        height=truth.height,
+        fx=truth.focal,
+        fy=truth.focal,
+        cx=truth.width / 2,
+        cy=truth.height / 2,
+        readout_time=0.0,
+    )
+
+
+def calibrated(one: Recorded, camera: RollingShutterCamera) -> CalibrationResult:
+    return calibrate(one.tracks, one.gyro, camera, config=TRACKED_IN_IMAGES)
+
+
+def beside(one: Recorded, disparity: float = 10.0) -> Recorded:
+    """Two views in one image: each point again, a width to the right."""
+    tracks, width = one.tracks, one.truth.width
+    points = np.concatenate([tracks.points, tracks.points + np.array([width - disparity, 0.0])])
+    kept = np.ones(len(points), dtype=bool)
+    kept[len(tracks.points) :] = tracks.points[:, 0] >= disparity
+    frames = np.tile(tracks.frames, 2)[kept]
+    ids = np.concatenate([tracks.ids, tracks.ids + tracks.ids.max() + 1])[kept]
+    order = np.argsort(frames, kind='stable')
+    both = replace(tracks, frames=frames[order], ids=ids[order], points=points[kept][order])
+    return replace(one, tracks=both)
+
+
+def test_two_views_in_one_image_are_refused():
+    one = recorded(41, frames=90)
+    camera = camera_of(one)
+    wide = replace(camera, width=2 * camera.width, cx=float(camera.width))
+    with pytest.raises(InputError, match='two views in one image, beside each other'):
+        calibrated(beside(one), wide)
+
+
+def flow(rng: np.random.Generator, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 2) of an image of 400x300 pixels, moved by a linear function of the place."""
+    points = rng.random((120, 2)) * [400.0, 300.0]
+    return points, points + (points - [200.0, 150.0]) @ motion + rng.normal(0, 0.1, (120, 2))
+
+
+def test_one_view_that_turns_and_approaches_is_one_view():
+    rng = np.random.default_rng(0)
+    turning = np.array([[0.01, 0.03], [-0.03, 0.01]])
+    assert repeated_axis([flow(rng, turning) for _ in range(12)], (400, 300)) is None
+    # A view that only pans has the same motion everywhere, and is one view nonetheless.
+    assert repeated_axis([flow(rng, 0.0 * turning) for _ in range(12)], (400, 300)) is None
+
+
+def test_a_squeezed_image_does_not_bend_what_a_node_needs():
+    one = recorded(42)
+    camera = camera_of(one)
+    points = one.tracks.points * [0.8, 1.0]
+    squeezed = replace(one, tracks=replace(one.tracks, points=points))
+    result = calibrated(squeezed, replace(camera, width=1024, cx=0.8 * camera.cx))
+    assert not result.failure
+    for value, true in (
+        (result.readout_time, one.truth.readout_time),
+        (result.time_offset, one.truth.time_offset),
+    ):
+        assert abs(value.value - true) < 4.0 * value.sigma
+    turn = Rotation.from_matrix(result.R_cam_imu @ one.truth.R_cam_imu.T).as_rotvec()
+    assert (np.abs(turn) < 4.0 * result.rotation_sigma).all()
+    note = ' '.join(result.warnings)
+    assert 'contradict the CameraInfo' in note and 'focal lengths fx' in note
+
+
+def test_a_vibrating_gyro_determines_neither_readout_nor_offset():
+    one = recorded(43)
+    camera = camera_of(one)
+    shaken = one.gyro.rates + np.random.default_rng(1).normal(0.0, 0.25, one.gyro.rates.shape)
+    result = calibrated(replace(one, gyro=replace(one.gyro, rates=shaken)), camera)
+    assert not (result.readout_time.determined or result.time_offset.determined)
+    assert abs(result.readout_time.value - one.truth.readout_time) < result.readout_time.sigma
+    assert not result.complete
+    assert 'vibration' in '\n'.join(report(result, camera))
+    text = parameter_file(result, 'A test.', camera=camera)
+    assert '    readout_time:' not in text and '    quat_cam_imu_xyzw:' in text
+
+
+def rates(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Slow and fast rates (300, 3) of a hand [rad/s], 30 per second."""
+    times = np.arange(300) / 30.0
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0.0, 6.28, (2, 3, 1))
+    slow = 0.4 * np.sin(2.0 * np.pi * 0.3 * times + phases[0])
+    fast = 0.2 * np.sin(2.0 * np.pi * np.array([[2.5], [3.1], [4.0]]) * times + phases[1])
+    return slow.T, fast.T
+
+
+@pytest.mark.parametrize(('share', 'is_stabilised'), [(1.0, False), (0.9, False), (0.3, True)])
+def test_a_stabilised_image_follows_slow_rotations_only(share, is_stabilised):
+    slow, fast = rates()
+    noise = np.random.default_rng(2).normal(0.0, 0.02, slow.shape)
+    found = gains(slow + share * fast + noise, slow + fast, 1.0 / 30.0)
+    assert found.are_stabilised == is_stabilised
+    assert found.fast == pytest.approx(share, abs=0.1)
+
+
+def test_a_wrong_focal_length_is_no_stabilisation():
+    slow, fast = rates()
+    assert not gains(0.5 * (slow + fast), slow + fast, 1.0 / 30.0).are_stabilised
+
+
+def test_halves_that_contradict_each_other_give_no_value(monkeypatch, tmp_path):
+    one = recorded(44, frames=120)
+    camera = camera_of(one)
+    right = calibrated(one, camera)
+    assert right.complete and not right.failure
+    monkeypatch.setattr(acceptance, '_HALVES_APART', -1.0)
+    result = calibrated(one, camera)
+    assert 'both halves' in result.failure
+    assert not any(part.determined for part in result.needed)
+    assert f'NOT USABLE: {result.failure}' in report(result, camera)
+
+
+def test_claims_of_lens_and_gyro_that_are_both_refuted_are_a_failure(monkeypatch):
+    final = SimpleNamespace(
+        unknowns=SimpleNamespace(parameters=np.zeros(1)),
+        covariance=np.zeros((1, 1)),
+        free=np.zeros(40, dtype=bool),
+        halves_apart=0.0,
+    )
+    data = SimpleNamespace(exposure=SimpleNamespace(assumed=np.zeros(1)))
+    for lens, gyro, fails in ((9.0, 9.0, True), (9.0, 1.0, False), (1.0, 9.0, False)):
+        monkeypatch.setattr(acceptance, 'contradiction', lambda *_, value=lens: value)
+        monkeypatch.setattr(acceptance, '_gyro_distance', lambda *_, value=gyro: value)
+        assert bool(acceptance._failure(data, final)) == fails
