@@ -6,6 +6,7 @@ gyro of the images that are skipped.
 
 from collections import deque
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -107,11 +108,17 @@ def _still(code: Code, measured: dict[str, Any]) -> Finding:
 def _motion_of_cells(previous: FrameImu, current: FrameImu, sensor: Sensor) -> Array:
     """Motion (ROWS, COLUMNS, 2) [px] of the cells' centres by the rotation of the camera alone."""
     assert current.since_previous is not None
-    intrinsics = sensor.intrinsics
-    centres = cell_centres(intrinsics.image_width, intrinsics.image_height)
-    points = centres.reshape(-1, 2)
-    rays, row_times = sensor.derotated(points, previous.motion)
+    points, unrotated, row_times = _cells(sensor)
+    rays = previous.motion.derotate(unrotated, row_times)
     turned = rays @ current.since_previous.rotation
     moved = sensor.project(turned, row_times, current.motion)
-    motions = moved - points
-    return motions.reshape(centres.shape)
+    return (moved - points).reshape(ROWS, COLUMNS, 2)
+
+
+@lru_cache(maxsize=4)
+def _cells(sensor: Sensor) -> tuple[Array, Array, Array]:
+    """Centres (N, 2) [px] of the cells, row by row, their rays (N, 3) and row times (N,) [s]."""
+    intrinsics = sensor.intrinsics
+    points = cell_centres(intrinsics.image_width, intrinsics.image_height).reshape(-1, 2)
+    pixels = intrinsics.to_sensor(points)
+    return points, sensor.camera.unproject(pixels), sensor.camera.pixel_times(pixels)
