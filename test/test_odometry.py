@@ -29,12 +29,13 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
-from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.doubts import Doubts
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
+from rs_relpose_ros.odometry.interruptions import SampleOrder
 from rs_relpose_ros.odometry.noise import noise_of_samples
 from rs_relpose_ros.odometry.offline import (
     consistency,
@@ -834,6 +835,113 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
         _, t = walked.truth.relative_pose(first[-1].imu_ns, after.imu_ns - jump)
         error = first[-1].R.T @ (after.position - first[-1].position) - t
         assert np.linalg.norm(error) < 3.0 * math.sqrt(np.trace(after.pose_covariance[:3, :3]))
+
+
+@pytest.mark.parametrize('seconds', [-0.115, -0.043, 0.085])
+def test_a_step_of_the_clock_of_the_imu_is_bridged_with_its_doubt(walked, seconds):
+    # Pairs are withheld for 0.5 s, until relpose_node has found the step.
+    jump, at = round(seconds * SECOND), 6.02
+    before, after = (
+        [pair for pair in walked.pairs if keeps(pair)]
+        for keeps in (
+            lambda pair: seconds_of(pair.current_imu_ns) < at,
+            lambda pair: seconds_of(pair.reference_imu_ns) > at + 0.5,
+        )
+    )
+    estimator, first = run(walked, pairs=before, samples=samples_of(walked, -1.0, at))
+    pairs = [
+        replace(
+            pair,
+            reference_imu_ns=pair.reference_imu_ns + jump,
+            current_imu_ns=pair.current_imu_ns + jump,
+        )
+        for pair in after
+    ]
+    samples = [
+        replace(sample, stamp_ns=sample.stamp_ns + jump) for sample in samples_of(walked, at, 13.0)
+    ]
+    estimator, second = run(walked, pairs=pairs, samples=samples, estimator=estimator)
+    assert (estimator.counts['lost'], len(estimator.starts)) == (1, 2)
+    assert len(second) > 0.5 * len(pairs)
+    for keyframe in second:
+        _, t = walked.truth.relative_pose(first[-1].imu_ns, keyframe.imu_ns - jump)
+        error = first[-1].R.T @ (keyframe.position - first[-1].position) - t
+        sigma = math.sqrt(np.trace(keyframe.pose_covariance[:3, :3]))
+        assert np.linalg.norm(error) < 2.5 * sigma
+        # The way within the unknown time, not that of a second without any sample.
+        assert sigma < 0.1 + 2.5 * abs(seconds)
+    assert (
+        ate(
+            [replace(keyframe, imu_ns=keyframe.imu_ns - jump) for keyframe in second],
+            walked.truth,
+        )
+        < 0.06
+    )
+
+
+def test_samples_that_are_late_are_no_clock_that_was_set_back():
+    known, order = ImuSamples(0.05), SampleOrder()
+
+    def at(milliseconds, value=0.0):
+        return ImuSample(round(milliseconds * 1e6), (value, 0.0, 1.0), (0.0, value, 9.8))
+
+    for k in [*range(20), *range(23, 40)]:
+        assert order.add(at(5.0 * k), known) == ([at(5.0 * k)], False)
+        known.add(at(5.0 * k))
+    # Three are late, one is repeated, two of another publisher are in between.
+    for sample in (at(100.0), at(105.0), at(110.0), at(60.0)):
+        assert order.add(sample, known) == ([sample], False)
+    others = [at(61.0, 3.0), at(65.0, 3.0)]
+    assert [order.add(sample, known) for sample in others] == [((), False)] * 2
+    assert order.add(at(200.0), known) == ([*others, at(200.0)], False)
+    # A clock that is set back by 23 ms.
+    known.add(at(200.0))
+    back = [at(177.0 + 5.0 * k, 2.0) for k in range(4)]
+    answers = [order.add(sample, known) for sample in back]
+    assert answers == [((), False)] * 3 + [(back, True)]
+
+
+def test_a_pair_that_contradicts_the_gyro_may_be_a_step_of_a_clock(walked):
+    estimator, _ = run(walked, pairs=walked.pairs[:16], samples=samples_of(walked, -1.0, 2.6))
+    doubtful = replace(
+        walked.pairs[16],
+        images=None,
+        status='NO_CONSENSUS',
+        reason="images and gyro contradict each other: a rotation 2.0 deg from the gyro's",
+    )
+    at_ns = estimator.newest_ns
+    certain = estimator.propagated(at_ns)
+    estimator.add_pair(doubtful)
+    doubted = estimator.propagated(at_ns)
+    # As far as the camera moves within a step of 0.2 s.
+    error = 0.2 * certain.R @ certain.velocity
+    more = doubted.pose_covariance[:3, :3]
+    assert error @ np.linalg.solve(certain.pose_covariance[:3, :3], error) > 14.2
+    assert error @ np.linalg.solve(more, error) < 3.0
+    np.testing.assert_array_equal(doubted.position, certain.position)
+    estimator.add_pair(replace(walked.pairs[16], reference_imu_ns=walked.pairs[15].current_imu_ns))
+    estimator.take(end=True)
+    settled = estimator.propagated(at_ns)
+    assert np.trace(settled.pose_covariance[:3, :3]) < 0.1 * np.trace(more)
+
+
+def test_the_covariance_of_a_badly_conditioned_window_is_that_of_marginals(walked, monkeypatch):
+    samples = samples_of(walked, -1.0, 3.2)
+    (good, _), (bad, _) = (run(walked, pairs=walked.pairs[:20], samples=samples) for _ in range(2))
+    graph = bad._run.graph
+
+    class Fails:
+        def __init__(self, *_):
+            raise RuntimeError('Indeterminate linear system')
+
+    monkeypatch.setattr(gtsam, 'Marginals', Fails)
+    graph._read(graph._count - 1)
+    wanted, found = (one._run.graph.newest.covariance for one in (good, bad))
+    np.testing.assert_allclose(np.diag(found), np.diag(wanted), rtol=1e-4)
+    sigmas = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(
+        found / np.outer(sigmas, sigmas), wanted / np.outer(sigmas, sigmas), atol=1e-4
+    )
 
 
 def test_samples_that_come_far_too_late_are_left_out(walked, tracked):

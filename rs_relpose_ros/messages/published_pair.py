@@ -41,6 +41,9 @@ _MOST_INFORMATION = 1e14
 # Largest speed [baselines/s, rad/s] of a message: above every camera, and its square is far from
 # an overflow. [chosen: 1e4 to 1e100 would do]
 _LARGEST_SPEED = 1e9
+# Begin of the reason of a pair that images and gyro contradict. [derived: as estimator.estimate
+# and pipeline.pipeline give it]
+_GYRO_CONTRADICTION = 'images and gyro contradict each other'
 # Interval that no pair reaches [ns]. [chosen: far above max_keyframe_interval]
 _LONGEST_NS = 100_000_000_000
 
@@ -124,6 +127,11 @@ class PublishedPair:
     def rotation_known(self) -> bool:
         """Whether `R` is known, as in every pose."""
         return bool(np.isfinite(self.R).all())
+
+    @property
+    def contradicts_gyro(self) -> bool:
+        """Whether it has no pose because images and gyro contradict each other."""
+        return self.images is None and self.reason.startswith(_GYRO_CONTRADICTION)
 
     @property
     def is_pure_rotation(self) -> bool:

@@ -1,7 +1,7 @@
 """Metric odometry from pairs and IMU samples, keyframe by keyframe; free of ROS.
 
 The same live and offline: the result depends on pairs and samples, not on the order of their
-arrival within `_LATE_NS`.
+arrival within `LATE_NS`.
 """
 
 from collections import Counter, deque
@@ -30,6 +30,15 @@ from rs_relpose_ros.odometry.graph import (
     KeyframeState,
     Loop,
 )
+from rs_relpose_ros.odometry.interruptions import (
+    acceleration,
+    after_unknown_time,
+    first_gap,
+    Interruption,
+    LATE_NS,
+    LONGEST_UNKNOWN,
+    SampleOrder,
+)
 from rs_relpose_ros.odometry.noise import knock_finding, knock_peak
 from rs_relpose_ros.odometry.pair import (
     as_loop,
@@ -38,7 +47,7 @@ from rs_relpose_ros.odometry.pair import (
     row_ns,
     without_far_velocities,
 )
-from rs_relpose_ros.odometry.publication import Publication, Stamp
+from rs_relpose_ros.odometry.publication import at_unknown_time, Publication, Stamp
 from rs_relpose_ros.odometry.starts import (
     continued,
     end_of,
@@ -58,12 +67,6 @@ from rs_relpose_ros.odometry.states import (
     StateInterval,
 )
 
-# Largest delay of a message. With a smaller one samples of a busy driver are lost; a larger one
-# delays each keyframe where a sample is missing. [chosen: 0.05 to 0.2 s: drivers are late by less]
-_LATE_NS = 100_000_000
-# Consecutive samples later than that of a clock that was set back; fewer may be a driver that
-# sends a block late. [chosen: 3 to 20 would do: at 200 Hz five are 25 ms]
-_SET_BACK = 5
 # Number of waiting pairs beyond which all but the newest are left out: the IMU bridges them at the
 # cost of one, so that a slow machine keeps up. [chosen: 5 to 30 would do: 10 are a second or two]
 _MOST_WAITING = 10
@@ -127,6 +130,11 @@ _LONGEST_START = 8.0
 _UNSOLVED_FIX = (
     'check the sigmas and noise densities of the parameter file, and report it with the recording'
 )
+# 1 sigma of the step of a clock that may be the reason why images and gyro contradict each other
+# [s]: the stamp of a state is unknown by it until a pair with the new offset is used. A smaller
+# one would not cover steps of half a second, a larger one would say nothing of a state.
+# [chosen: 0.1 to 0.2 s: three sigmas are the longest step that relpose_node looks for]
+_UNKNOWN_STEP = 0.15
 # Reason of a path that ends where samples of the IMU are missing.
 _GAP = 'the IMU has a gap, or its clock jumped: see its driver'
 # Fewest pairs that determine the scale of a start in motion. [derived: velocity, tilt and bias are
@@ -157,6 +165,10 @@ class _Run:
     confirmed: int = 0  # since the start, by so many pairs in motion
     published: bool = False
     path: int = 0  # number of earlier starts
+    # Of an ended one: from when on the samples continue its newest keyframe, if a short
+    # interruption lies between; whether none do, as the clock was set.
+    resumed_ns: int | None = None
+    is_broken: bool = False
 
     @property
     def newest_ns(self) -> int:
@@ -200,7 +212,8 @@ class OdometryEstimator:
         self._runs: list[_Run] = []
         self._last_ns: int | None = None
         self._wrong_starts = 0  # since the last right one in motion
-        self._behind = 0  # consecutive samples that came too late
+        # Of a sensor alone at 0, of samples with a gyro at 1.
+        self._orders = SampleOrder(), SampleOrder()
         self._row_ns = 0  # from the stamped to the middle row
         self._offset_ns = 0  # of the camera's clock from that of the IMU
         self._watched_ns = 0  # time of the newest sample at which overdue pairs were looked for
@@ -208,6 +221,7 @@ class OdometryEstimator:
         self._frame_ns = 0
         self._arrived_ns = 0
         self._frame_interval_ns = 0
+        self._doubts_clocks = False  # whether a clock may have been set since the newest keyframe
         self._unusable_ns = 0  # time of the newest pair that could not be used
         self._longest_interval = parameters.keyframes.max_keyframe_interval
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
@@ -276,7 +290,13 @@ class OdometryEstimator:
         newest = self._samples.both_until_ns
         if newest is not None:
             self._end(reason, newest)
-        self._behind = self._watched_ns = 0
+        self._forget_samples()
+
+    def _forget_samples(self) -> None:
+        """Begin with other samples, on another clock."""
+        self._watched_ns = 0
+        for order in self._orders:
+            order.clear()
         self._samples.clear()
         self._waiting, self._last_ns = {}, None
 
@@ -298,12 +318,55 @@ class OdometryEstimator:
 
     def _add_timed(self, sample: ImuSample) -> None:
         """Add a sample that has its time."""
+        order = self._orders[sample.angular_velocity is not None]
+        samples, set_back = order.add(sample, self._samples)
+        if set_back:
+            self._set_back(samples[0].stamp_ns)
+        for one in samples:
+            self._add_in_order(one)
+
+    def _set_back(self, next_ns: int) -> None:
+        """Go on after the clock of the IMU was set back to a time."""
+        reason = 'the clock of the IMU was set back'
+        last_ns = self._samples.both_until_ns
+        if last_ns is not None:
+            run, gap = self._run, Interruption(last_ns, next_ns)
+            try:
+                # No samples are missing: hardly any time has passed.
+                self._interrupt(gap, reason, last_ns, passed=0.0)
+            except GraphError as error:
+                self._fail(error, last_ns)
+            if run is not None and run.resumed_ns is None:
+                run.is_broken = True
+        self._forget_samples()
+
+    def _interrupt(
+        self, gap: Interruption, reason: str, imu_ns: int, *, passed: float = 0.5
+    ) -> None:
+        """End the path; the next one continues after a short interruption.
+
+        `passed`: expected share of its seconds.
+        """
+        run = self._run
+        if run is None or not run.published or gap.seconds > LONGEST_UNKNOWN:
+            self._end(reason, imu_ns)
+            return
+        interval = self._samples.between(run.newest_ns, gap.last_ns)
+        if interval is not None:
+            # The IMU leads to the last sample before it.
+            run.graph.add(interval, None, at_rest=False)
+            offset = run.stamps[-1][1] - run.stamps[-1][0]
+            run.stamps.append((gap.last_ns - offset, gap.last_ns))
+        before = run.graph.newest
+        rate = self._samples.gyro.values[-1] - before.gyro_bias
+        run.graph.restate(after_unknown_time(before, gap.seconds, rate, passed=passed))
+        run.resumed_ns = gap.next_ns
+        self._end(reason, imu_ns, known=True)
+
+    def _add_in_order(self, sample: ImuSample) -> None:
+        """Add a sample whose place is free."""
         newest = self._samples.both_until_ns
-        too_late = newest is not None and sample.stamp_ns < newest - _LATE_NS
-        self._behind = self._behind + 1 if too_late else 0
-        if newest is not None and self._behind == _SET_BACK:
-            self._start_again('the clock of the IMU was set back')
-        elif too_late:
+        if newest is not None and sample.stamp_ns < newest - LATE_NS:
             return  # for any pair
         self._watch_rate(sample)
         if not self._gyro.repeats(sample):
@@ -363,6 +426,7 @@ class OdometryEstimator:
         if pair.images is None and contradiction(pair) is None:
             self.counts['without images'] += 1
             self._unusable_ns = pair.current_imu_ns
+            self._doubts_clocks |= pair.contradicts_gyro
             return
         if pair.images is not None:
             self._row_ns = row_ns(pair)
@@ -422,9 +486,13 @@ class OdometryEstimator:
             return None
         stamp_ns = run.stamps[-1][0] + imu_ns - run.newest_ns
         state = run.graph.propagated(interval)
-        return self._publication(run).state(
+        found = self._publication(run).state(
             state, interval.rates[-1], self._stamp(run, stamp_ns, imu_ns)
         )
+        if self._doubts_clocks:
+            accelerated = acceleration(state.R, interval.forces[-1] - state.accel_bias)
+            found = at_unknown_time(found, accelerated, interval.rates, _UNKNOWN_STEP)
+        return found
 
     def smoothed(self) -> list[Odometry]:
         """All keyframes, given all measurements; needs `keep`."""
@@ -483,7 +551,7 @@ class OdometryEstimator:
         newest = self._samples.both_until_ns
         if newest is None or newest < pair.current_imu_ns:
             return False
-        if newest >= pair.current_imu_ns + _LATE_NS:
+        if newest >= pair.current_imu_ns + LATE_NS:
             return True
         return (
             self._run is not None
@@ -508,7 +576,7 @@ class OdometryEstimator:
             return None
         interval = self._samples.between(run.newest_ns, pair.current_imu_ns)
         if interval is None:
-            self._end(_GAP, pair.current_imu_ns)
+            self._end_at_gap(run, pair.current_imu_ns)
             return None
         self._add(run, pair, interval)
         if self._run is None or not (run.published or self._known(run)):
@@ -559,6 +627,7 @@ class OdometryEstimator:
             self._corrections += 1
             self._reject(run, pair)
             return
+        self._doubts_clocks = False
         run.observed_ns, run.pairs = at_ns, run.pairs + 1
         run.largest = max(run.largest, innovation)
         run.confirmed += run.published and pair.has_direction
@@ -596,7 +665,7 @@ class OdometryEstimator:
             return None
         interval = self._samples.between(run.newest_ns, pair.reference_imu_ns)
         if interval is None:
-            self._end(_GAP, pair.reference_imu_ns)
+            self._end_at_gap(run, pair.reference_imu_ns)
             return None
         # A pair is missing: the IMU bridges it.
         run.graph.add(interval, None, at_rest=False)
@@ -609,12 +678,12 @@ class OdometryEstimator:
         run = self._run
         if run is None or not run.published:
             return
-        until_ns = imu_ns - _LATE_NS
+        until_ns = imu_ns - LATE_NS
         if until_ns > run.newest_ns and any(
             series.coverage(run.newest_ns, until_ns) is Coverage.NEVER
             for series in (self._samples.gyro, self._samples.force)
         ):
-            self._end(_GAP, imu_ns)
+            self._end_at_gap(run, imu_ns)
             return
         age = seconds_between(run.observed_ns, imu_ns)
         if age <= self._due(run, imu_ns):
@@ -714,8 +783,9 @@ class OdometryEstimator:
         run = self._last_run
         if run is None:
             return PathEnd.origin(), None
-        seconds = seconds_between(run.newest_ns, imu_ns)
-        interval = self._samples.between(run.newest_ns, imu_ns)
+        since_ns = run.newest_ns if run.resumed_ns is None else run.resumed_ns
+        seconds = seconds_between(since_ns, imu_ns)
+        interval = None if run.is_broken else self._samples.between(since_ns, imu_ns)
         if interval is not None and seconds <= LONGEST_PROPAGATED:
             state = run.graph.propagated(interval)
             if self._end_is_known:
@@ -814,6 +884,15 @@ class OdometryEstimator:
             self._doubted = newest.doubts
             self._doubts_covariance = newest.covariance[DOUBTS, DOUBTS]
             self._change(OdometryState.LOST, reason, imu_ns)
+
+    def _end_at_gap(self, run: _Run, imu_ns: int) -> None:
+        """End a run at the first gap of the IMU after its newest keyframe."""
+        longest_ns = to_nanoseconds(self._imu.max_imu_gap)
+        gap = first_gap(self._samples, run.newest_ns, longest_ns)
+        if gap is None:
+            self._end(_GAP, imu_ns)
+        else:
+            self._interrupt(gap, _GAP, imu_ns)
 
     def _change(
         self,

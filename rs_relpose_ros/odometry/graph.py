@@ -239,6 +239,16 @@ class KeyframeGraph:
             covariance=by @ self.newest.covariance @ by.T + noise,
         )
 
+    def restate(self, state: KeyframeState) -> None:
+        """Let what is propagated begin at another state of the newest keyframe.
+
+        For a graph that has ended: its factors do not know that state.
+        """
+        self.newest = state
+        pose = gtsam.Pose3(gtsam.Rot3(state.R), state.position)
+        self._nav_state = gtsam.NavState(pose, state.velocity)
+        self._step = _NO_STEP
+
     def add(
         self,
         interval: ImuInterval,
@@ -321,8 +331,15 @@ class KeyframeGraph:
         return variance
 
     def scale_sigma(self) -> float:
-        """1 sigma of the newest velocity, along its least certain direction, by its length."""
-        variance = np.linalg.norm(self.newest.covariance[VELOCITY, VELOCITY], 2)
+        """1 sigma of the newest velocity, along its least certain direction, by its length.
+
+        Given the heading, which a path that continues knows less well, and which is no scale.
+        """
+        covariance = self.newest.covariance
+        with_heading = covariance[VELOCITY, ROTATION] @ self.newest.R[2]
+        heading = self.newest.R[2] @ covariance[ROTATION, ROTATION] @ self.newest.R[2]
+        by_heading = np.outer(with_heading, with_heading) / heading
+        variance = np.linalg.norm(covariance[VELOCITY, VELOCITY] - by_heading, 2)
         speed = float(np.linalg.norm(self.newest.velocity))
         return math.sqrt(variance) / max(speed, _LEAST_SPEED)
 
@@ -342,7 +359,7 @@ class KeyframeGraph:
         """All keyframes since the start, given all measurements; needs `keep`."""
         with _solving():
             values, marginals = self._smoothed()
-            return [_state(values, marginals, k) for k in range(self._count)]
+            return [_state(values, k, _joint(marginals, _keys(k))) for k in range(self._count)]
 
     def add_loops(self, loops: Sequence[Loop]) -> list[Loop]:
         """Add pairs of keyframes far apart to what is smoothed, and return those that count.
@@ -582,9 +599,8 @@ class KeyframeGraph:
         """Read the estimates of the smoother."""
         values = self._smoother.calculateEstimate()
         window = self._smoother.getFactors()
-        marginals = gtsam.Marginals(window, values)
         self._values = values
-        self.newest = _state(values, marginals, newest)
+        self.newest = _state(values, newest, _window_covariance(window, values, newest))
         pose = values.atPose3(X(newest))
         velocity = values.atVector(V(newest))
         self._bias = values.atConstantBias(B(newest))
@@ -654,12 +670,8 @@ def _solving() -> Iterator[None]:
         raise GraphError(f'the graph cannot be solved: {first_line}') from error
 
 
-def _state(
-    values: Any,
-    marginals: Any,
-    k: int,
-) -> KeyframeState:
-    """A keyframe with its covariance."""
+def _state(values: Any, k: int, covariance: Array) -> KeyframeState:
+    """A keyframe with its covariance, that of `_keys`."""
     pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
     return KeyframeState(
         R=pose.rotation().matrix(),
@@ -668,8 +680,35 @@ def _state(
         gyro_bias=bias.gyroscope(),
         accel_bias=bias.accelerometer(),
         doubts=values.atVector(L(0)),
-        covariance=_joint(marginals, [X(k), V(k), B(k), L(0)]),
+        covariance=covariance,
     )
+
+
+def _keys(k: int) -> list[int]:
+    """The unknowns of a keyframe in the order of its covariance."""
+    return [X(k), V(k), B(k), L(0)]
+
+
+def _window_covariance(window: Any, values: Any, newest: int) -> Array:
+    """Covariance of the unknowns of the newest keyframe, given the factors of a window.
+
+    ``gtsam.Marginals`` squares the condition of the equations, which is too large after a loss:
+    position and heading are known to decimetres then, each step to fractions of a millimetre.
+    """
+    keys = _keys(newest)
+    try:
+        return _joint(gtsam.Marginals(window, values), keys)
+    except RuntimeError:
+        pass
+    known = gtsam.Values.keys(values)
+    ordering = gtsam.Ordering()
+    for key in [*(key for key in known if key not in keys), *keys]:
+        ordering.push_back(key)
+    A, _ = window.linearize(values).jacobian(ordering)
+    size = sum(values.atVector(L(0)).shape) + _OWN.stop
+    root = np.linalg.qr(A).R[-size:, -size:]
+    back = np.linalg.inv(root)
+    return np.asarray(back @ back.T)
 
 
 def _joint(marginals: Any, keys: list[int]) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,26 @@ class Stamp(NamedTuple):
     imu_ns: int
     path: int  # number of earlier starts
     corrections: int  # of the keyframe, since the first start
+
+
+def at_unknown_time(state: Odometry, acceleration: Array, rates: Array, sigma: float) -> Odometry:
+    """The same of a time that is known to `sigma` [s] only.
+
+    `acceleration` (3,): in the world; `rates` (K, 3): recent ones, as the body turns otherwise
+    within that time.
+    """
+    by_time = np.concatenate([state.velocity, state.angular_velocity])
+    moving = np.concatenate([state.R @ by_time[:3], state.R @ by_time[3:]])
+    turning = np.cross(state.angular_velocity, state.velocity)
+    accelerating = np.concatenate([state.R.T @ acceleration - turning, np.zeros(3)])
+    more = np.outer(moving, moving)
+    more[3:, 3:] += (rates**2).sum(axis=1).mean() / 3.0 * np.eye(3)
+    more_velocity = np.outer(accelerating, accelerating)
+    return replace(
+        state,
+        pose_covariance=state.pose_covariance + sigma**2 * more,
+        velocity_covariance=state.velocity_covariance + sigma**2 * more_velocity,
+    )
 
 
 class Publication(NamedTuple):
