@@ -627,6 +627,37 @@ def test_a_gyro_with_little_more_than_its_bias(rotating):
         assert faults[0].estimate == pytest.approx(math.degrees(1.0), rel=0.02)
 
 
+@pytest.mark.parametrize('offset', [0.44, -0.6, 0.0])
+def test_clocks_that_are_far_apart_are_found_by_the_rotations(offset):
+    """Images and gyro would be independent as configured; a wrong gyro agrees at no offset."""
+    rng = np.random.default_rng(11)
+    times = np.arange(0.0, 8.0, 0.1)
+    frequencies, phases = rng.uniform(0.4, 2.6, size=(3, 6)), rng.uniform(0.0, 6.3, size=(3, 6))
+
+    def angles(at):
+        return 0.08 * np.sin(6.3 * frequencies * at + phases).sum(axis=1)
+
+    for is_other_gyro in (False, True):
+        sums = RotationSums()
+        for k, end in enumerate(times):
+            by_images = angles(end) - angles(end - 0.1) + 2e-3 * rng.normal(size=3)
+            by_gyro = angles(end - offset) - angles(end - offset - 0.1)
+            if is_other_gyro:
+                by_gyro = 0.03 * rng.normal(size=3)
+            sums.add(100 * MS * k, 0.1, by_images, by_gyro)
+        found = faults_of(sums)
+        if is_other_gyro:
+            assert [one.why for one in found] == [Why.INDEPENDENT] * 2
+        elif offset:
+            assert [(one.code, one.why) for one in found] == [
+                (Code.TIME_OFFSET, Why.AT_OTHER_TIME)
+            ]
+            assert found[0].estimate - found[0].active == pytest.approx(offset, abs=0.02)
+            assert f'set time_offset: {found[0].estimate:.2f}' in line(found[0])
+        else:
+            assert not found
+
+
 def test_a_steady_translation_is_no_rotation():
     """It is similar to a constant rate of the images, without information on the axes."""
     rng, sums = np.random.default_rng(5), RotationSums()

@@ -29,13 +29,16 @@ WIDTH, HEIGHT = 320, 240
 INTERVAL_NS = 33_000_000
 
 
-def walk(count, static=None, seed=3, step=(5.0, 1.5)):
-    """Images that move by about `step` px each, with noise, and their motions."""
+def walk(count, static=None, seed=3, step=(5.0, 1.5), speed=0.0):
+    """Images that move by about `step` px each, with noise, and their motions.
+
+    The content of a part, `static`, moves by `speed` px an image.
+    """
     rng = np.random.default_rng(seed)
     texture = make_texture(rng, (700, 1400)).astype(float)
     fixed = make_texture(rng, (HEIGHT, WIDTH)).astype(float)
     place = np.array([700.0, 300.0])
-    for _ in range(count):
+    for number in range(count):
         motion = np.array(step) * rng.normal(size=2)
         place = np.clip(place + motion, (20, 20), (1060, 440))
         matrix = np.array([[1.0, 0.0, place[0]], [0.0, 1.0, place[1]]])
@@ -43,7 +46,7 @@ def walk(count, static=None, seed=3, step=(5.0, 1.5)):
             texture, matrix, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
         if static is not None:
-            image = np.where(static, fixed, image)
+            image = np.where(static, np.roll(fixed, round(speed * number), axis=1), image)
         yield place.copy(), np.clip(image + rng.normal(size=image.shape), 0, 255).astype(np.uint8)
 
 
@@ -95,6 +98,19 @@ def test_a_wall_without_texture_repeats_nothing():
     parts = StillParts()
     image = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)
     assert not any(added(parts, k, image, np.array([8.0, 8.0])) for k in range(5))
+
+
+def test_an_object_that_moves_slowly_is_no_static_part():
+    part = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    part[:, WIDTH // 3 :] = True
+    for speed in (0.0, 1.0):
+        parts, before = StillParts(), None
+        steps = walk(150, part, step=(14.0, 9.0), speed=speed)
+        for number, (place, image) in enumerate(steps):
+            motion = np.zeros(2) if before is None else before - place
+            added(parts, number, image, motion)
+            before = place
+        assert parts.static().any() == (speed == 0.0)
 
 
 @pytest.mark.parametrize('side', ['left', 'bottom'])

@@ -603,10 +603,27 @@ def gross_errors(
                 settings={'time_offset': configured.sensor.time_offset + ahead},
             ),
         )
+    if rotations.offset is not None:
+        return (_other_time(rotations.offset, configured),)
     found = tuple(_rotation_errors(rotations, configured))
     # Any error may leave images and gyro independent for a while, if frames are lost.
     certain = found and (not before or found[0].why is not Why.INDEPENDENT)
     return found if certain else before
+
+
+def _other_time(offset: float, configured: Configured) -> Finding:
+    """That images and gyro rotate alike at another offset, far from the active one."""
+    applied = float(configured.active[LIVE.index('time_offset')])
+    active = configured.sensor.time_offset + applied
+    return Finding(
+        Code.TIME_OFFSET,
+        FindingState.WRONG,
+        Why.AT_OTHER_TIME,
+        (active,),
+        (active + offset,),
+        unit='s',
+        settings={'time_offset': round(active + offset, 2)},
+    )
 
 
 def _rotation_errors(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:

@@ -132,6 +132,7 @@ class Why(str, Enum):
     LEFT_HANDED = 'left_handed'
     INDEPENDENT = 'independent'  # images and gyro rotate independently
     CLOCKS_APART = 'clocks_apart'
+    AT_OTHER_TIME = 'at_other_time'  # images and gyro rotate alike at another offset alone
     SIDEWAYS = 'sideways'  # rows of the sensor are columns of the image
     CLOCKWISE = 'clockwise'  # images rotated by 90 deg
     COUNTERCLOCKWISE = 'counterclockwise'

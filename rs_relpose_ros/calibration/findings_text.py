@@ -253,6 +253,16 @@ def _clocks_apart(finding: Finding) -> Text:
     )
 
 
+def _at_other_time(finding: Finding) -> Text:
+    assert finding.estimate is not None and finding.active is not None
+    return Text(
+        f'images and gyro rotate alike at a time offset of about {finding.estimate:.2f} s and no '
+        f'other one, active {finding.active:.2f} s',
+        f'set time_offset: {finding.settings["time_offset"]:.2f}, and refine it with '
+        '"rs_relpose calibrate" or track_time_offset: true',
+    )
+
+
 def _no_specific_force(finding: Finding) -> Text:
     fault = ForceFault(finding.evidence.measured['mean_length_m_s2'])
     return Text(fault.message, fault.fix)
@@ -396,6 +406,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.IMAGE_GEOMETRY, Why.INDEPENDENT): _independent,
     (Code.TIME_OFFSET, Why.INDEPENDENT): _independent,
     (Code.TIME_OFFSET, Why.CLOCKS_APART): _clocks_apart,
+    (Code.TIME_OFFSET, Why.AT_OTHER_TIME): _at_other_time,
     (Code.ACCEL_SCALE, Why.NO_SPECIFIC_FORCE): _no_specific_force,
     (Code.ACCEL_AXES, Why.CONSISTENT): _accelerometer,
     (Code.ACCEL_AXES, Why.OPPOSITE): _contradicting_accelerometer,

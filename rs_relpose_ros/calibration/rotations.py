@@ -16,7 +16,7 @@ from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
-from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
 
 # Number of rays below which no rotation is estimated. Fewer would follow single wrong matches.
@@ -43,6 +43,22 @@ _LARGE_ANGLE = 1.0
 # Logarithm of a ratio of likelihoods that is certain. Less would report turned axes by chance, as
 # errors of neighbours are alike; more would report them later. [chosen: 10 to 30 would do]
 _LOG_LIKELIHOOD = 20.0
+# Largest offset of the clocks that is tried [s]. A larger one leaves too few of the rotations of
+# 8 s, and the stamps show it as the images arrive. [chosen: 1 to 3 s would do]
+_LARGEST_OFFSET = 2.0
+# Step of the offsets [s]. A longer one may miss the optimum. [measured: the rotation of a walk is
+# explained within 0.05 s of the right offset]
+_OFFSET_STEP = 0.02
+# Offsets within this distance [s] of the best one are the same explanation. [chosen: half a period
+# of the steps of a walk is 0.25 s; 0.08 to 0.2 s would do]
+_SAME_OFFSET = 0.12
+# Smallest offset [s] that is found so: pairs measure smaller ones. [chosen: the prior of offsets]
+_LEAST_OFFSET = 0.05
+# Share of the images' rotation that the right offset leaves at most. [measured: 0.08 to 0.28 with
+# clocks that are off by 0.5 s]
+_LEFT_AT_OFFSET = 0.4
+# Rotations that an offset has to compare. Fewer agree by chance. [chosen: 2 to 3 s]
+_FEWEST_AT_OFFSET = 25
 
 
 def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
@@ -77,6 +93,8 @@ class RotationComparison:
     scale: float  # images over gyro, after `rotation`
     by_gyro: float  # [rad] sum of the angles
     count: int
+    # Time offset [s], if the rotations agree there, and at no other one, without any rotation.
+    offset: float | None
 
     @property
     def is_turned(self) -> bool:
@@ -115,15 +133,16 @@ class RotationSums(LastSeconds):
         """The comparison; None if there are too few or too small rotations."""
         if len(self) < _FEWEST:
             return None
-        _, intervals, theta, phi = (np.array(column) for column in zip(*self, strict=True))
+        stamps_ns, intervals, theta, phi = (np.array(column) for column in zip(*self, strict=True))
         by_images, by_gyro = (float(np.linalg.norm(one, axis=1).sum()) for one in (theta, phi))
         if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:
             return None
         left_of_all = _left(float((theta * phi).sum()), theta, phi)
-        theta, phi = (  # without the constant rate that fits best
-            one - np.outer(intervals, intervals @ one / (intervals @ intervals))
-            for one in (theta, phi)
-        )
+        ends = (stamps_ns - stamps_ns[0]) / NANOSECONDS
+        offset = None
+        if left_of_all > _LEFT_AT_OFFSET:
+            offset = _offset_of(ends, intervals, theta, phi)
+        theta, phi = (_without_rate(one, intervals) for one in (theta, phi))
         M = theta.T @ phi
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
@@ -144,7 +163,49 @@ class RotationSums(LastSeconds):
             trace / max(float((phi**2).sum()), _NO_ROTATION),
             by_gyro,
             len(self),
+            offset,
         )
+
+
+def _without_rate(rotations: Array, intervals: Array) -> Array:
+    """Rotations (N, 3) without the constant rate that fits best."""
+    rate = intervals @ rotations / (intervals @ intervals)
+    return np.asarray(rotations - np.outer(intervals, rate))
+
+
+def _offset_of(ends: Array, intervals: Array, theta: Array, phi: Array) -> float | None:
+    """Time offset [s] at which rotations of images and gyro (N, 3) agree; None unless certain.
+
+    `ends` (N,) [s], in the order of time: the gyro between two rotations is interpolated.
+    """
+    times = np.concatenate([[ends[0] - intervals[0]], ends])
+    angles = np.vstack([np.zeros(3), np.cumsum(phi, axis=0)])
+    offsets = np.arange(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1e-9, _OFFSET_STEP)
+    left, counts = np.full(len(offsets), np.inf), np.zeros(len(offsets), dtype=int)
+    for k, offset in enumerate(offsets):
+        begins, stops = ends - intervals + offset, ends + offset
+        known = (begins >= times[0]) & (stops <= times[-1])
+        counts[k] = np.count_nonzero(known)
+        if counts[k] < _FEWEST_AT_OFFSET:
+            continue
+        by_gyro = np.column_stack(
+            [
+                np.interp(stops[known], times, axis) - np.interp(begins[known], times, axis)
+                for axis in angles.T
+            ]
+        )
+        by_images = _without_rate(theta[known], intervals[known])
+        by_gyro = _without_rate(by_gyro, intervals[known])
+        left[k] = _left(float((by_images * by_gyro).sum()), by_images, by_gyro)
+    best = int(np.argmin(left))
+    apart = np.abs(offsets - offsets[best]) > _SAME_OFFSET
+    rival = min(float(left[apart].min()), float(left[len(offsets) // 2]))
+    # Twice the certainty of other causes: the best of many offsets.
+    needed = 2.0 * _LOG_LIKELIHOOD / (1.5 * max(counts[best], 1))
+    is_certain = left[best] < _LEFT_AT_OFFSET and math.log(rival / left[best]) > needed
+    if not is_certain or abs(offsets[best]) < _LEAST_OFFSET:
+        return None
+    return float(offsets[best])
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:

@@ -10,7 +10,8 @@ would make:
 with I_j the last image that was new, I_k the current image, both reduced in size, and W(I_j) the
 image I_j moved by the rotation. A cell is informative where E is large, and still where D is small
 against E. An image whose informative cells are all still is a repetition of the image before.
-A cell that is still in most of the images of some seconds is static.
+A cell that is still in most of the images of some seconds, and also against an image of half a
+second before, is static: an object that moves slowly is not.
 """
 
 from collections import deque
@@ -51,6 +52,10 @@ _ALL = 0.97
 # Time over which cells are counted [ns]. In a shorter time a person may keep one point of the
 # scene at its place in the image. [chosen: 3 to 10 s would do]
 _WINDOW_NS = to_nanoseconds(5.0)
+# Age [ns] that the image before has at least with which static cells are compared as well. A lower
+# one takes an object that moves by a pixel an image for a static part, a higher one finds static
+# parts later. [chosen: 0.3 to 1 s would do]
+_EARLIER_NS = to_nanoseconds(0.5)
 # Least number of images of that time in which a static cell has to be informative. Fewer images
 # name a static part by chance. [chosen: a walk of 5 s has 150 images, 50 of which turn enough]
 _LEAST_IMAGES = 20
@@ -68,6 +73,8 @@ class StillParts:
     def reset(self) -> None:
         """Forget all images."""
         self._before: NDArray[np.float32] | None = None  # the last new image, reduced
+        # Two images of before with their stamps: the older one is that for comparison.
+        self._earlier: list[tuple[int, NDArray[np.float32]]] = []
         self._counted: deque[tuple[int, Flags, Flags]] = deque()
         # Of these images, in how many each cell was informative, and in how many it was still.
         self._informative = np.zeros((ROWS, COLUMNS), dtype=int)
@@ -88,13 +95,29 @@ class StillParts:
         if before is None or before.shape != reduced.shape:
             self._before = reduced
             return False
-        informative, still = _compared(before, reduced, motion * scale)
+        informative, expected, still = _compared(before, reduced, motion * scale)
         enough = informative.mean() >= _INFORMATIVE
         repeated = bool(enough and still[informative].mean() >= _ALL)
         if not repeated:
-            self._count(stamp_ns, informative, still)
+            lasting = self._lasts(stamp_ns, reduced, expected)
+            self._count(stamp_ns, informative, still & lasting)
             self._before = reduced
         return repeated
+
+    def _lasts(self, stamp_ns: int, reduced: NDArray[np.float32], expected: Array) -> Flags:
+        """Which cells are as in an image of at least `_EARLIER_NS` before; none without one.
+
+        `expected` (ROWS, COLUMNS) [gray levels]: the change that the rotation since the last
+        image would make.
+        """
+        earlier = self._earlier
+        if not earlier or stamp_ns - earlier[-1][0] >= _EARLIER_NS:
+            earlier.append((stamp_ns, reduced))
+            del earlier[:-2]
+        first_ns, first = earlier[0]
+        if stamp_ns - first_ns < _EARLIER_NS:
+            return np.zeros(expected.shape, dtype=bool)
+        return np.asarray(_cell_means(np.abs(reduced - first)) < _STILL * expected)
 
     def static(self) -> Flags:
         """Cells (ROWS, COLUMNS) that are static by the images of the last seconds."""
@@ -128,8 +151,8 @@ def free_of(static: Flags, width: int, height: int) -> NDArray[np.uint8]:
 
 def _compared(
     before: NDArray[np.float32], now: NDArray[np.float32], motion: Array
-) -> tuple[Flags, Flags]:
-    """Which cells (ROWS, COLUMNS) are informative, and which of all cells are still."""
+) -> tuple[Flags, Array, Flags]:
+    """Which cells (ROWS, COLUMNS) are informative, the change E of all, and which are still."""
     height, width = before.shape
     # Content that comes from far outside the image is not known. A wrong gyro makes motions of
     # many image widths, which `remap` would reflect at the border one width at a time.
@@ -137,7 +160,7 @@ def _compared(
     field = np.where(known[..., np.newaxis], motion, 0.0).astype(np.float32)
     turned = known & (np.linalg.norm(field, axis=2) >= _LEAST_MOTION)
     if not turned.any():
-        return turned, turned
+        return turned, np.zeros(turned.shape), turned
     dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
     u = np.arange(width, dtype=np.float32)
     v = np.arange(height, dtype=np.float32)
@@ -152,7 +175,7 @@ def _compared(
     expected = _cell_means(np.abs(moved - before))
     changed = _cell_means(np.abs(now - before))
     informative = turned & (expected >= _LEAST_CHANGE)
-    return np.asarray(informative), np.asarray(changed < _STILL * expected)
+    return np.asarray(informative), expected, np.asarray(changed < _STILL * expected)
 
 
 def _cell_means(values: NDArray[np.float32]) -> Array:
