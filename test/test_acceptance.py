@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
-from rs_relpose_ros.calibrate import acceptance
+from rs_relpose_ros.calibrate import acceptance, procedure
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
+from rs_relpose_ros.calibration import model
 from rs_relpose_ros.calibration.image_motion import gains, repeated_axis
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError
@@ -154,3 +155,26 @@ def test_claims_of_lens_and_gyro_that_are_both_refuted_are_a_failure(monkeypatch
         monkeypatch.setattr(acceptance, 'contradiction', lambda *_, value=lens: value)
         monkeypatch.setattr(acceptance, '_gyro_distance', lambda *_, value=gyro: value)
         assert bool(acceptance._failure(data, final)) == fails
+
+
+def test_a_zoom_is_named():
+    one = recorded(45, frames=180)
+    camera = camera_of(one)
+    middle = np.array([camera.cx, camera.cy])
+    share = one.tracks.frames / one.tracks.frames.max() - 0.5
+    zoomed = middle + (one.tracks.points - middle) * (1.0 + 0.05 * share)[:, None]
+    result = calibrated(replace(one, tracks=replace(one.tracks, points=zoomed)), camera)
+    (note,) = (text for text in result.warnings if 'focal_drift' in text)
+    assert 4.0 < float(note.split('changes by ')[1].split(' %')[0]) < 6.0
+
+
+@pytest.mark.parametrize(('principal_point', 'is_named'), [(639.5, True), (500.0, False)])
+def test_a_camera_matrix_of_another_resolution_is_named(principal_point, is_named):
+    one = recorded(46, frames=2)
+    camera = replace(camera_of(one), cx=639.5, cy=359.5)
+    off = np.zeros(model.GLOBAL)
+    off[model.FOCAL] = np.log(0.5)
+    off[model.CENTER] = np.array([principal_point, 359.5]) - [1279.5, 719.5]
+    camera = replace(camera, cx=principal_point)
+    found = procedure._of_another_resolution(camera, off)
+    assert ('another resolution, 2.00 times as large' in found) == is_named

@@ -96,10 +96,7 @@ def refuse_stabilised(
 
 
 def contradiction(data: Observations, final: fit.Fit) -> float:
-    """Factor by which the sigmas of a CameraInfo that images contradict are too small; 1 if not.
-
-    A claim that is refuted must not pull the other parameters.
-    """
+    """Factor by which sigmas of a CameraInfo that images refute are too small; 1 if not."""
     if data.knowledge is not LensKnowledge.CLAIMED or not final.free[model.FOCAL]:
         return 1.0
     prior = knowledge.prior_covariance_of_lens(data.camera)
@@ -153,6 +150,8 @@ def accepted(result: CalibrationResult, data: Observations, final: fit.Fit) -> C
         rotation_sigma=np.maximum(result.rotation_sigma, _SIGMAS['axes']),
         lens=lens,
         exposure=_not_determined(result.exposure, 'exposure', failure),
+        # They are about values that mean nothing.
+        warnings=(),
         failure=failure,
     )
 

@@ -66,8 +66,8 @@ def confirmed(data: Observations, final: fit.Fit) -> OffsetCourse:
     """The course of the offset as a fit and its blocks of time show it."""
     course = data.course
     if course.is_constant:
-        change = None if data.follows_intervals else certain_change(final, model.OFFSET)
-        if change is None:
+        change = certain_change(final)
+        if change is None or change.place != model.OFFSET or data.follows_intervals:
             return course
         if change.kind is Kind.DRIFT:
             return OffsetCourse(drift=change.value, origin=float(np.median(data.times)))
@@ -79,16 +79,46 @@ def confirmed(data: Observations, final: fit.Fit) -> OffsetCourse:
     return course if abs(size) > _CONFIRMED * sigma else OffsetCourse()
 
 
-def certain_change(final: fit.Fit, place: int) -> Trend | None:
-    """The change of a parameter, if it explains the blocks of time better than all others."""
+def certain_change(final: fit.Fit) -> Trend | None:
+    """The change of a parameter that explains the blocks of time better than any other one's."""
     found = trends(final, _DRIFTING, (model.OFFSET,))
-    if not found or found[0].place != place or found[0].square < _CERTAIN:
+    if not found or found[0].square < _CERTAIN:
         return None
-    others = [one.square for one in found if one.place != place]
-    if found[0].square < max(others, default=0.0) + _LEAD:
+    best = found[0]
+    others = [one.square for one in found if one.place != best.place]
+    if best.square < max(others, default=0.0) + _LEAD:
         return None
-    drift = next(one for one in found if one.place == place and one.kind is Kind.DRIFT)
-    return drift if drift.square > found[0].square - _LEAD else found[0]
+    drift = next(one for one in found if one.place == best.place and one.kind is Kind.DRIFT)
+    return drift if drift.square > best.square - _LEAD else best
+
+
+def change_in_words(final: fit.Fit) -> str:
+    """Name a change within the recording that the fit does not follow; '' for none."""
+    change = certain_change(final)
+    if change is None:
+        return ''
+    total = change.value * (change.end - change.begin)
+    if change.place == model.FOCAL:
+        return (
+            f'focal_drift: the focal length changes by {100.0 * total:.1f} % over the recording, '
+            'as by a zoom or a lens that focuses: switch both off. All values are means'
+        )
+    name = next(name for name, part in OFFLINE.parts.items() if change.place in _places(part))
+    return _OTHER_CHANGES.get(name, '')
+
+
+def _places(part: slice) -> range:
+    return range(part.start, part.stop)
+
+
+# What a change of a parameter means that has no name of its own.
+_OTHER_CHANGES = {
+    'time_offset': 'the time offset changes within the recording, neither at one time nor evenly: '
+    'its sigma is that of its mean',
+    'readout_time': 'the readout time changes over the recording: fix the frame rate and exposure',
+    'gyro_bias': 'the bias of the gyro changes over the recording: let it warm up',
+    'axes': 'the axes turn over the recording: fix the camera and the IMU to each other',
+}
 
 
 def offset_changes(data: Observations, found: fit.Fit, of_row_0: Estimate) -> OffsetChanges | None:

@@ -201,9 +201,6 @@ def _calibrated(
         free[model.SLOPE] = changed.stamps.covariates.any()
         return _fit_with_lens(about, changed, before.unknowns, free, _ALL_PAIRS, rng)
 
-    beyond = acceptance.contradiction(data, final)
-    if beyond > 1.0:
-        data, final = refitted(replace(data, doubt=beyond), final)
     data, final = following.followed(data, final, refitted, at_end=config.offset_at_end)
     acceptance.refuse_stabilised(data, final.unknowns, data.pairs(_NEIGHBOURS, rng))
     progress(0.7)
@@ -387,6 +384,11 @@ def _fit_with_lens(
             begin = fit.restarted(problem, coarse, 2.0)
         found = errors.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
+        beyond = acceptance.contradiction(data, found)
+        if beyond > 2.0 * data.doubt:
+            # A claim that is refuted must not pull the others in the next round.
+            data = replace(data, doubt=beyond)
+            continue
         if (np.abs(coarse.parameters[model.LENS]) <= _LENS_STAYS).all():
             break
     assert found is not None
@@ -571,7 +573,8 @@ def _notes(
     against = ''
     if data.knowledge is LensKnowledge.CLAIMED and final.free[model.FOCAL]:
         against = _against_claims(data, parameters, covariance)
-    return unsettled, _UNCLEAR.get(data.stamps.varying, ''), against
+    unclear = _UNCLEAR.get(data.stamps.varying, '')
+    return unsettled, unclear, against, following.change_in_words(final)
 
 
 def _slope(
@@ -646,9 +649,38 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
             names.append(text)
     if not names:
         return ''
+    by_resolution = _of_another_resolution(camera, off)
+    if by_resolution:
+        return by_resolution
     return (
         f'the images contradict the CameraInfo, and show {" and ".join(names)}: calibrate with '
         '--lens, and check for images that were cropped, scaled or rotated'
+    )
+
+
+# Change of a focal length (logarithm) from which a matrix may be that of another resolution.
+# [chosen: 1.2 times; resolutions differ by more]
+_OTHER_RESOLUTION = 0.18
+# Largest distance of the principal point from that of such a matrix, as a share of the width.
+# [chosen: twice the sigma of a principal point, 1.5 %]
+_SAME_PLACE = 0.03
+
+
+def _of_another_resolution(camera: RollingShutterCamera, off: Array) -> str:
+    """Name a claimed matrix all of whose values are those of `camera` by one factor; '' if not.
+
+    `off` (GLOBAL,) is the lens of `camera` less the claimed one.
+    """
+    ratio = float(off[model.FOCAL])
+    claimed = np.array([camera.cx, camera.cy]) - off[model.CENTER]
+    expected = math.exp(ratio) * (claimed + 0.5) - 0.5
+    apart = np.hypot(*(expected - (camera.cx, camera.cy)))
+    if abs(ratio) < _OTHER_RESOLUTION or apart > _SAME_PLACE * camera.width:
+        return ''
+    return (
+        f'the camera matrix is that of images of another resolution, {math.exp(-ratio):.2f} times '
+        f'as large: the images have a focal length of {camera.fx:.1f} px and a principal point of '
+        f'{camera.cx:.1f}, {camera.cy:.1f} px. Give the CameraInfo of this resolution'
     )
 
 
