@@ -8,7 +8,7 @@ from test_monitor import CONFIGURED
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibration import assessment
-from rs_relpose_ros.calibration.assessment import unexplained
+from rs_relpose_ros.calibration.assessment import Effect, unexplained
 from rs_relpose_ros.calibration.changes import change_of, drift_doubts, Kind
 from rs_relpose_ros.calibration.findings import Code, FindingState, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import line
@@ -125,6 +125,12 @@ def test_a_zoom_is_measured(rate):
     assert found.is_drift_of('focal_log')
     assert found.value == pytest.approx(rate, abs=4.0 * found.sigma)
     assert found.now == pytest.approx(deviations[-1], abs=4.0 * found.now_sigma)
+    effect = Effect(np.full((5, LIVE.size), 400.0), np.full((6, LIVE.size), 200.0))
+    off = assessment.off_now(Code.FOCAL_LENGTH, found.now, found.now_sigma, [effect])
+    (wrong,) = assessment.assess(pairs, [off], (), CONFIGURED).faults
+    assert wrong.code is Code.FOCAL_LENGTH
+    fx = CONFIGURED.camera.fx
+    assert wrong.estimate == pytest.approx(fx * np.exp(deviations[-1]), abs=0.015 * fx)
     # Even while the focal length is right in the mean, that of now is in doubt.
     ranked = assessment.hypotheses(pairs, CONFIGURED)
     doubt = assessment.undetermined(pairs, CONFIGURED, drift_doubts(ranked, STAMPS_NS, CONFIGURED))

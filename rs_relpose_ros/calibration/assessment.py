@@ -392,10 +392,12 @@ def off_now(
 ) -> Inconsistency:
     """A quantity of one value that changes, with its deviation at the last pair."""
     quantity = findings.BY_CODE[code]
-    deviations, sigmas = np.zeros(LIVE.size), np.zeros(LIVE.size)
-    deviations[quantity.part], sigmas[quantity.part] = deviation, sigma
+    deviations = np.where(_parts_of(quantity), deviation, 0.0)
+    covariance = np.diag(np.where(_parts_of(quantity), sigma**2, 0.0))
     certainty = abs(deviation) / sigma
-    return Inconsistency(quantity, deviations, sigmas, certainty, *_shifts(deviations, effects))
+    return Inconsistency(
+        quantity, deviations, covariance, certainty, *_shifts(deviations, effects)
+    )
 
 
 def _shifts(deviation: Array, effects: Sequence[Effect]) -> tuple[float, float]:
@@ -706,6 +708,17 @@ _FEWEST_IF_NAMED = 50
 # What changes images or gyro from pair to pair, other than any deviation of the configuration.
 # [derived: codes of the findings whose texts say what to do]
 _CANDIDATES = (Code.IMAGE_GEOMETRY, Code.GYRO_NOISE, Code.TIME_OFFSET)
+
+
+def contradicting(differing: int, pairs: int) -> Finding:
+    """The finding that images contradict the gyro in `differing` of the last pairs."""
+    return Finding(
+        Code.UNKNOWN_CAUSE,
+        FindingState.WRONG,
+        Why.CONTRADICTING,
+        evidence=Evidence(pairs=pairs, measured={'differing': differing}),
+        candidates=_CANDIDATES,
+    )
 
 
 def unexplained(estimated: Calibration, *, is_named: bool = False) -> Finding | None:

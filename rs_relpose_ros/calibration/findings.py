@@ -127,6 +127,7 @@ class Why(str, Enum):
     STEPPED = 'stepped'  # a clock was set while the sensors ran
     DRIFTING = 'drifting'  # a clock runs at another rate, or a lens zooms or focuses
     UNEXPLAINED = 'unexplained'  # pairs contradict each other, whatever parameter is changed
+    CONTRADICTING = 'contradicting'  # images the gyro, in most of the last pairs
     # Gross errors: `is_gross`.
     GROSS = 'gross'
     LEFT_HANDED = 'left_handed'

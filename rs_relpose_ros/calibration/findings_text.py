@@ -361,6 +361,18 @@ def _unknown_cause(finding: Finding) -> Text:
     )
 
 
+def _contradicting(finding: Finding) -> Text:
+    evidence = finding.evidence
+    return Text(
+        f'images and gyro contradict each other in {evidence.measured["differing"]} of the last '
+        f'{evidence.pairs} pairs, and the cause is not known; candidates: stabilisation of lens '
+        'or images, images that were resized or squeezed without their CameraInfo, vibration, a '
+        'moving object, clocks',
+        'compare size and focal lengths of the CameraInfo with the images; switch stabilisation '
+        'off; run "rs_relpose calibrate"',
+    )
+
+
 def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
@@ -389,6 +401,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.OFFSET_DRIFT, Why.DRIFTING): _offset_drift,
     (Code.FOCAL_DRIFT, Why.DRIFTING): _focal_drift,
     (Code.UNKNOWN_CAUSE, Why.UNEXPLAINED): _unknown_cause,
+    (Code.UNKNOWN_CAUSE, Why.CONTRADICTING): _contradicting,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
     (Code.KNOCK, Why.OFF): _knock,
