@@ -247,7 +247,8 @@ def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -
     motion = (problem.motion1, problem.motion2)[image]
     rate = motion.angular_velocity
     of_image = problem.observations[problem.valid]
-    times = of_image[:, 18 + image]
+    # A column of its own: kernels would be compiled again for one that is spread over the rows.
+    times = np.ascontiguousarray(of_image[:, 18 + image])
     shares = camera.readout_shares(points)
     path = GyroPath.constant(rate, -1.0, 1.0) if motion.path is None else motion.path
     states = row_states(path, pair.R_cam_imu, times, shares)
