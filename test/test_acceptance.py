@@ -178,3 +178,16 @@ def test_a_camera_matrix_of_another_resolution_is_named(principal_point, is_name
     camera = replace(camera, cx=principal_point)
     found = procedure._of_another_resolution(camera, off)
     assert ('another resolution, 2.00 times as large' in found) == is_named
+
+
+def test_a_gyro_in_another_unit_and_a_view_that_does_not_turn_are_refused():
+    one = recorded(47, frames=120)
+    camera = camera_of(one)
+    in_degrees = replace(one, gyro=replace(one.gyro, rates=np.degrees(one.gyro.rates)))
+    with pytest.raises(InputError, match='it is in deg/s'):
+        calibrated(in_degrees, camera)
+    other = recorded(48, frames=120)
+    turned = 20.0 * np.linalg.norm(one.gyro.rates) / np.linalg.norm(other.gyro.rates)
+    fast = replace(other.gyro, rates=turned * other.gyro.rates)
+    with pytest.raises(InputError, match='does not turn against the camera'):
+        calibrated(replace(one, gyro=fast), camera)

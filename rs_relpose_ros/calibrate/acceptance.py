@@ -7,7 +7,6 @@ fitted to; what is claimed of camera, gyro and exposure before the fit is anothe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 import math
 
@@ -18,8 +17,8 @@ from rs_relpose_ros.calibration import fit, knowledge, model
 from rs_relpose_ros.calibration.image_motion import gains, repeated_axis
 from rs_relpose_ros.calibration.knowledge import LensKnowledge
 from rs_relpose_ros.calibration.observations import (
+    MeasuredRates,
     Observations,
-    Pair,
     PairSelection,
     rates_at,
     Start,
@@ -44,6 +43,15 @@ _HALVES_APART = 3.5
 # wrong by the square of the share. [measured: below 0.01 of recordings, 0.09 to 0.16 of vibrating
 # ones, whose readout time is up to 14 sigma off]
 _VIBRATING = 0.05
+# Share of the rotation of the camera below which the images show something else than a scene at
+# rest. A focal length that is wrong by a factor of 5 shows as much. [measured: 0.03 with an object
+# in 0.8 of the view, 0.3 to 0.4 with one in 0.4 or an interior in 0.75 of it]
+_OTHER_VIEW = 0.2
+# Correlation of the rates of images and gyro from which they are of one rotation. [chosen: 0.5 to
+# 0.9 would do]
+_SAME_ROTATION = 0.7
+# Relative difference of a factor from that of a unit. [chosen: translation changes gains by 10 %]
+_SAME_UNIT = 0.2
 # Pairs that are compared for two views in one image: apart by time [s], points, least points, and
 # largest number. [chosen: the camera moves by more than the noise]
 _PAIRS = PairSelection((0.133,), 200, 40, 60)
@@ -69,27 +77,39 @@ def refuse_two_views(data: Observations) -> None:
     )
 
 
-def refuse_stabilised(
-    data: Observations, unknowns: model.Unknowns, neighbours: Sequence[Pair]
-) -> None:
-    """InputError if the images follow slow rotations of the camera only.
+def refuse_other_motion(measured: MeasuredRates, start: Start, interval: float) -> None:
+    """InputError if the images do not turn as the camera does.
 
-    `neighbours` are pairs of images that follow one another.
+    They are stabilised, or most of the view does not belong to the scene. `interval` [s] is that
+    between frames.
     """
-    start = Start(
-        float(unknowns.parameters[model.OFFSET]), unknowns.R_cam_imu, focal_factor=1.0, misfit=0.0
-    )
-    offsets = np.array([start.offset])
-    rates = rates_at(data.measured_rates(neighbours), offsets, start)
+    rates = rates_at(measured, np.array([start.offset]), start)
     known = np.isfinite(rates.gyro[0]).all(axis=1)
-    found = gains(rates.images[known], rates.gyro[0][known], data.interval)
-    if found is None or not found.are_stabilised:
+    found = gains(rates.images[known], rates.gyro[0][known], interval)
+    if found is None:
         return
-    raise InputError(
-        f'the images are stabilised (stabilisation): they follow {100.0 * found.fast:.0f} % of '
-        f'fast rotations of the camera and {100.0 * found.slow:.0f} % of slow ones. Nothing can '
-        'be determined: switch the stabilisation of lens and video off'
-    )
+    fast, slow = (f'{100.0 * gain:.0f} %' for gain in found)
+    if found.are_stabilised:
+        raise InputError(
+            f'the images are stabilised (stabilisation): they follow {fast} of fast rotations of '
+            f'the camera and {slow} of slow ones. Nothing can be determined: switch the '
+            'stabilisation of lens and video off'
+        )
+    alike = np.corrcoef(rates.images[known, :2].ravel(), rates.gyro[0][known, :2].ravel())[0, 1]
+    factor = 1.0 / max(found.fast, 1e-3)
+    if alike > _SAME_ROTATION and not _OTHER_VIEW < found.fast < 1.0 / _OTHER_VIEW:
+        in_degrees = abs(factor / math.degrees(1.0) - 1.0) < _SAME_UNIT
+        unit = 'it is in deg/s' if in_degrees else f'it gives {factor:.2g} times the rotation'
+        raise InputError(
+            f'the gyro is not in rad/s (gyro_unit): {unit}. Nothing can be determined: correct '
+            'the driver'
+        )
+    if max(found) < _OTHER_VIEW:
+        raise InputError(
+            f'most of the view does not turn against the camera (by {slow} of its rotation): it '
+            'is inside a vehicle (interior), an object fills the view (moving_object), or gyro '
+            'and images are of two devices. Nothing can be determined: record a scene at rest'
+        )
 
 
 # -- Claims -------------------------------------------------------------------------------------
@@ -191,8 +211,9 @@ def _failure(data: Observations, final: fit.Fit) -> str:
     if claims > 1.0 and _gyro_distance(final) > CONTRADICTED:
         return (
             'the images contradict what is claimed of the lens as well as of the gyro, so that no '
-            'value can be used. Candidates: stabilised images (stabilisation), several views or '
-            'moving parts in the image, images that were changed after they were taken'
+            'value can be used. Candidates: a gyro in another unit (gyro_unit), stabilised images '
+            '(stabilisation), several views or moving parts in the image (moving_object), images '
+            'that were changed after they were taken'
         )
     if final.halves_apart > _HALVES_APART:
         return (

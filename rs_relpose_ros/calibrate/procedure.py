@@ -202,7 +202,6 @@ def _calibrated(
         return _fit_with_lens(about, changed, before.unknowns, free, _ALL_PAIRS, rng)
 
     data, final = following.followed(data, final, refitted, at_end=config.offset_at_end)
-    acceptance.refuse_stabilised(data, final.unknowns, data.pairs(_NEIGHBOURS, rng))
     progress(0.7)
     final = errors.widened(final, in_images=config.exposed)
     progress(0.8)
@@ -346,7 +345,9 @@ def _coarse_fit(
     tried = offset_course.tried_offsets(starts[0].offset)
     course = offset_course.proposed(observations.rates_at(measured, tried, starts[0]))
     if not course.is_constant:
-        starts = starts_of(data.following(course).measured_rates(pairs)) or starts
+        measured = data.following(course).measured_rates(pairs)
+        starts = starts_of(measured) or starts
+    acceptance.refuse_other_motion(measured, starts[0], data.interval)
     fits = []
     for start in starts:
         lens = np.log(start.focal_factor) * np.eye(N_LENS)[0]
