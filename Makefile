@@ -69,7 +69,7 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
     package.xml rs_relpose_lab/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
-	@echo 'Setting up $(VENV): a minute or two and 0.7 GB.'
+	@echo 'Setting up $(VENV): a minute or two and 0.75 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	grep -v -e '^#' -e '^ros-' requirements/base.txt | \
 	    xargs $(pip) install --no-compile $(CONSTRAINTS:%=-c %)
