@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from test_monitor import flight, NONE
 
+from rs_relpose_ros.calibration import assessment
 from rs_relpose_ros.calibration.findings import Code, FindingState
 from rs_relpose_ros.calibration.findings_text import line
 from rs_relpose_ros.calibration.second_motion import second_share, SecondMotions
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+from rs_relpose_ros.pipeline.monitor import Contradictions
 
 NO_TURN = np.array([0.004, -0.003])  # 1 + a similarity's turn and scale
 
@@ -66,6 +68,33 @@ def test_an_object_is_in_view_from_the_fifth_pair_until_long_after_the_last():
     later = [motions.add(pair, everything) for _ in range(60)]
     assert all(later[:30])
     assert not any(later[45:])
+
+
+@pytest.mark.parametrize(
+    ('squares', 'withheld'),
+    [
+        ([2.0, 40.0, 3.0] * 6, False),  # single poor pairs
+        ([0.5] * 9 + [np.inf] * 2 + [1.0] * 9, False),
+        ([90.0, 3.0, 50.0, 70.0, 25.0, 120.0, 19.0, 66.0], True),  # squeezed images
+        ([1.0, np.inf, 90.0, np.inf, 2.0, np.inf], True),  # stabilised images
+    ],
+)
+def test_pairs_among_many_that_contradict_the_gyro_are_not_trusted(squares, withheld):
+    """An infinite chi-square: the rotation of the gyro was rejected."""
+    contradictions = Contradictions()
+    for square in squares:
+        everything = np.ones(30, dtype=bool)
+        pose = pose_of(everything, 1.0 if square == np.inf else square)
+        if square == np.inf:
+            diagnostics = replace(pose.diagnostics, rejected=pose, gyro_square=np.nan)
+            pose = replace(pose, diagnostics=diagnostics)
+        contradictions.add(pose)
+    assert contradictions.too_many is withheld
+    differing, count = contradictions.counts
+    text = line(assessment.contradicting(differing, count))
+    assert f'contradict each other in {differing} of the last {count} pairs' in text
+    contradictions.clear()
+    assert not contradictions.too_many
 
 
 def test_a_scene_behind_an_object_that_agrees_with_the_gyro_keeps_its_poses():

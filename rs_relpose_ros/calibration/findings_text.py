@@ -32,6 +32,9 @@ from rs_relpose_ros.imu.buffer import ForceFault
 # Longest text [characters] that is read as findings of a message: those of all causes at once
 # need a tenth of it. [chosen: 20,000 to 1,000,000 would do; it bounds the work of a reader]
 _LONGEST = 100_000
+# Rotation of axes [deg] below which the gyro itself may be misaligned. [chosen: data sheets state
+# up to a degree]
+_MISALIGNED = 1.0
 
 
 class Text(NamedTuple):
@@ -121,6 +124,8 @@ def _off(finding: Finding) -> Text:
             fix += f', or {name}: true'
     if 'stamp_row' in settings:
         fix += f' (stamp_row: {settings["stamp_row"]} is equivalent)'
+    if finding.code is Code.AXES and (finding.estimate or 0.0) < _MISALIGNED:
+        fix += ' (a gyro with misaligned axes looks alike)'
     if finding.candidates:
         fix += f' (ambiguous: {" or ".join(code.value for code in finding.candidates)})'
     return Text(

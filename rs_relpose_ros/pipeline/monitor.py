@@ -50,6 +50,17 @@ _REMEMBERED = 20.0
 # Number of pairs as which the prior counts that covariances are right. Fewer would widen the first
 # pairs of each recording by chance. [chosen: half of those that are remembered]
 _PRIOR_PAIRS = 10.0
+# Last pairs of which few may contradict the gyro. [chosen: about a second of keyframes]
+_RECENT = 8
+# Number of them whose images reject the gyro's rotation, from which no pose is published. Fewer
+# would follow single poor pairs, more would publish poses of a camera that stabilises its images.
+# [measured: 2 of 41 pairs of a recording in poor light, none of other correct recordings]
+_MOST_REJECTED = 2
+# The same of pairs whose rotation differs from the gyro's by `_DIFFERENT`. [measured: none on
+# correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
+_MOST_DIFFERENT = 5
+# Chi-square (3 degrees of freedom) of that difference. [derived: once in 1000 by definition]
+_DIFFERENT = 16.0
 # Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
 # a moving object would widen the pairs of many seconds.
 # [chosen: far above the 99.9 % quantile of two degrees of freedom, 6.9]
@@ -89,6 +100,7 @@ class ConsistencyMonitor:
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self.clock_steps = ClockSteps()
         self._second_motions = SecondMotions()
+        self.contradictions = Contradictions()
         self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
         self._drift: Finding | None = None  # that is followed
         self.change: Change | None = None  # by the pairs so far, not followed yet
@@ -219,8 +231,13 @@ class ConsistencyMonitor:
         self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
         if not gross:
             self._test_without_cause()
+        if self.contradictions.too_many and not self.health.faults:
+            unknown = assessment.contradicting(*self.contradictions.counts)
+            others = assessment.not_evaluated(set(), unknown.code)
+            self.health = Assessment((unknown, *others))
         self._wrong_configuration = bool(self.health.faults)
-        if self._wrong_configuration:
+        # Nor are velocities of rotations that contradict the gyro.
+        if self._wrong_configuration or self.contradictions.counts[0] > _MOST_REJECTED:
             self.acceleration.clear()
         also = self.acceleration.finding()
         also_found = () if also is None else (also,)
@@ -330,6 +347,7 @@ class ConsistencyMonitor:
         self._recursion = Posterior()
         self.rotations.clear()
         self.acceleration.clear()
+        self.contradictions.clear()
         self._directions.clear()
         self.clock_steps.end_doubt()
         self._inconsistent, self._gross = [], ()
@@ -420,6 +438,33 @@ def _effect(information: posterior.PairInformation, pose: RelativePose) -> Effec
             np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True
         ),
     )
+
+
+class Contradictions:
+    """How many of the last pairs contradict the gyro, from the first one on."""
+
+    def __init__(self) -> None:
+        self._kinds: deque[tuple[bool, bool]] = deque(maxlen=_RECENT)
+
+    def add(self, pose: RelativePose) -> None:
+        """Add a pair with the pose of its estimate, which may be rejected."""
+        is_rejected = pose.diagnostics.rejected is not None
+        self._kinds.append((is_rejected, is_rejected or pose.diagnostics.gyro_square > _DIFFERENT))
+
+    def clear(self) -> None:
+        """Forget the pairs."""
+        self._kinds.clear()
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of pairs that contradict the gyro, and of all of the last ones."""
+        return sum(differs for _, differs in self._kinds), len(self._kinds)
+
+    @property
+    def too_many(self) -> bool:
+        """Whether so many contradict it that no other one is to be trusted."""
+        rejected = sum(is_rejected for is_rejected, _ in self._kinds)
+        return rejected > _MOST_REJECTED or self.counts[0] > _MOST_DIFFERENT
 
 
 class Agreement:

@@ -63,6 +63,8 @@ _UNMATCHED_PERIOD = 0.5
 _STEP_SOUGHT = (
     'images and gyro contradict each other, other than before: a step of a clock is looked for'
 )
+# Reason for a pair among others that contradict the gyro. [derived: text for people]
+_CONTRADICTING = 'the images of most of the last pairs contradict the gyro, whatever the cause'
 # Reason for a pair that may follow an object. [derived: text for people]
 _TWO_MOTIONS = (
     'the matches have two motions, and the images contradict the gyro: an object moves in the view'
@@ -366,6 +368,8 @@ class Pipeline(Processor[PairResult]):
         )
         stamps_ns = history.stamp_ns, frame.stamp_ns
         doubtful = monitor.clock_steps.add(stamps_ns, since, data, pose)
+        if data is not None:
+            monitor.contradictions.add(pose)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
@@ -373,6 +377,8 @@ class Pipeline(Processor[PairResult]):
             pose = suppressed(pose, monitor.health)
             if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
+            if monitor.contradictions.too_many:
+                pose = withheld(pose, _CONTRADICTING)
             if follows_object:
                 pose = withheld(pose, _TWO_MOTIONS)
         self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured))
