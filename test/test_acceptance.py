@@ -191,3 +191,10 @@ def test_a_gyro_in_another_unit_and_a_view_that_does_not_turn_are_refused():
     fast = replace(other.gyro, rates=turned * other.gyro.rates)
     with pytest.raises(InputError, match='does not turn against the camera'):
         calibrated(replace(one, gyro=fast), camera)
+
+
+def test_regions_that_contradict_each_other_are_named():
+    factors = np.ones(model.GLOBAL)
+    assert acceptance.regions_in_words(SimpleNamespace(regions=factors)) == ''
+    factors[model.OFFSET] = 12.0
+    assert 'static_region' in acceptance.regions_in_words(SimpleNamespace(regions=factors))

@@ -38,6 +38,9 @@ _IMPOSSIBLE = 4.0
 # limited to that of 3 sigmas. [derived: p = 1e-5 of chi-square over the 18 parameters of a fit is
 # 3.0]
 _HALVES_APART = 3.5
+# Factor of the variance of a value by the scatter of regions of the image, beyond which they
+# contradict each other. [measured: at most 2 of correct recordings and real ones]
+_REGIONS_APART = 9.0
 # Noise of the mean rate of the gyro over an interval between frames, as a share of the rms of its
 # rate, beyond which the rows of an image see another rotation than the gyro. The readout time is
 # wrong by the square of the share. [measured: below 0.01 of recordings, 0.09 to 0.16 of vibrating
@@ -222,6 +225,18 @@ def _failure(data: Observations, final: fit.Fit) -> str:
             'changes. Candidates: zoom or focus, a mount that moves, a clock, stabilised images'
         )
     return ''
+
+
+def regions_in_words(final: fit.Fit) -> str:
+    """Name regions of the image that contradict each other; '' if they do not."""
+    needed = OFFLINE.mask('readout_time', 'time_offset', 'axes')
+    if not len(final.regions) or final.regions[needed].max() < _REGIONS_APART:
+        return ''
+    return (
+        'parts of the image contradict each other, which the sigmas contain. Candidates: a part '
+        'that does not move with the scene (static_region, moving_object), a distortion that is '
+        'none of the radial ones, images that were changed after they were taken'
+    )
 
 
 def _gyro_distance(final: fit.Fit) -> float:

@@ -575,7 +575,8 @@ def _notes(
     if data.knowledge is LensKnowledge.CLAIMED and final.free[model.FOCAL]:
         against = _against_claims(data, parameters, covariance)
     unclear = _UNCLEAR.get(data.stamps.varying, '')
-    return unsettled, unclear, against, following.change_in_words(final)
+    change = following.change_in_words(final)
+    return unsettled, unclear, against, change, acceptance.regions_in_words(final)
 
 
 def _slope(

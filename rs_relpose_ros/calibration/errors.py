@@ -160,7 +160,8 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
     by_prior = _by_prior(final)
     of_noise = final.covariance - by_prior @ by_prior.T
     of_halves, apart = _disagreement(final, of_noise)
-    wider = np.sqrt(_between_regions(final, of_noise) * of_halves)
+    of_regions = _between_regions(final, of_noise)
+    wider = np.sqrt(of_regions * of_halves)
     by_tangential = np.zeros((GLOBAL, 2))
     shared = 1.0
     if in_images:
@@ -168,7 +169,9 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
         shared += _SHARED**2 * final.problem.pairs
     by_doubt = np.hstack([by_prior, by_tangential])
     covariance = shared * of_noise * np.outer(wider, wider) + by_doubt @ by_doubt.T
-    return replace(final, covariance=covariance, by_doubt=by_doubt, halves_apart=apart)
+    return replace(
+        final, covariance=covariance, by_doubt=by_doubt, halves_apart=apart, regions=of_regions
+    )
 
 
 def _by_prior(final: Fit) -> Array:

@@ -5,7 +5,7 @@ in `calibration.errors`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import itertools
 import math
 from typing import NamedTuple
@@ -439,6 +439,8 @@ class Fit:
     by_doubt: Array
     # Mean squared difference, in sigmas, of the parameters of two halves; 0 before it is known.
     halves_apart: float = 0.0
+    # (GLOBAL,) factors of the variances by regions of the image; empty before they are known.
+    regions: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def information(self) -> Array:
