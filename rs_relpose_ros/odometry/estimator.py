@@ -96,9 +96,9 @@ _SAME_NS = 1_000_000
 # hand, and the gyro integrates for longer. [chosen: 0.5 to 2 s: about a step of a walk]
 _GRAVITY_WINDOW = 1.0
 # Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist, and
-# loops share images. With less, states are beyond their covariances: with 1.8 are 19 % of the
-# positions of a phone. [measured: docs/lab/odometry.md, "Pairs in a row", "Noise by innovations"]
-_SHARED = 2.5
+# loops share images. With less, some states are beyond their covariances, with more all are too
+# uncertain. [measured: docs/lab/odometry.md, "Thirty walks"]
+_SHARED = 2.0
 # Innovation of a contradicting pair (chi squared per degree of freedom). A larger gate uses pairs
 # of moving objects, a smaller one rejects right ones: above 4 is one in 800 by chance with 5
 # degrees of freedom, fewer with 11. [derived: chi squared]

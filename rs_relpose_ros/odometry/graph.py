@@ -55,8 +55,8 @@ _LEAST_SPEED = 0.1
 # Least variance of a pair by that of its images, after the start. A smaller one makes paths worse
 # and some states too certain, as errors of consecutive pairs persist; a larger one makes all
 # states too uncertain.
-# [measured: docs/lab/odometry.md, "Noise by innovations", least variance]
-_LEAST_VARIANCE = 1.0
+# [measured: docs/lab/odometry.md, "Thirty walks"]
+_LEAST_VARIANCE = 0.6
 # Largest share of the window that one interval takes. A longer bridge would push the states before
 # it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
 _LONGEST_STEP = 0.25
