@@ -98,8 +98,8 @@ _AS_GOOD = 4.0
 # The same if one of the two can nearly cancel others, as the principal point does with the axes:
 # less would name one of them by chance. [derived: 5 in the log-likelihood]
 _CLEARLY = 10.0
-# Pairs from which a quantity that can nearly cancel others is named beside a better one. Fewer
-# would name it for what the first motions of another cause leave, more would name one of two
+# Pairs from which a quantity that can nearly cancel others is named though another fits as well.
+# Fewer would name it for what the first motions of another cause leave, more would name one of two
 # equal causes for longer. [measured: beside a gyro whose axes are misaligned by half a degree the
 # principal point fits nearly as well as its axes for 20 pairs, and clearly worse from 24 on]
 _FEWEST_BESIDE = 25
@@ -191,8 +191,11 @@ def find_inconsistencies(
         needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
         lead = solution.evidence(quantity) - other.evidence(second)
         # A second one of more evidence is not certain: its pairs contradict each other.
-        is_early = second.alone and len(estimated.b) < _FEWEST_BESIDE
-        if not found and not is_early and 0.0 <= lead < needed:
+        is_early = needed == _CLEARLY and len(estimated.b) < _FEWEST_BESIDE
+        if not found and is_early and 0.0 <= lead < needed:
+            if quantity.alone:
+                break
+        elif not found and 0.0 <= lead < needed:
             alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution

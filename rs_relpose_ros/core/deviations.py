@@ -154,10 +154,11 @@ LIVE = Selection.of(
     'time_offset',
     'readout_time',
     'gyro_bias',
+    'gyro_scale',
+    'gyro_skew',
     'focal_log',
     'distortion',
     'principal_point',
-    gyro_scale=COMMON,
 )
 # Deviations of the calibration of a recording: all. Those that it does not estimate are doubts.
 OFFLINE = Selection.of(*PARTS)
