@@ -26,7 +26,13 @@ from rs_relpose_ros.calibrate.procedure import (
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.calibration import fit as fitting
 from rs_relpose_ros.calibration import knowledge, model, observations
-from rs_relpose_ros.calibration.errors import fit, jackknife, stretches, widened
+from rs_relpose_ros.calibration.errors import (
+    fit,
+    jackknife,
+    stretches,
+    weights_of_stretches,
+    widened,
+)
 from rs_relpose_ros.calibration.fit import (
     evaluate,
     Fit,
@@ -706,6 +712,38 @@ def test_a_recording_of_the_model_is_hardly_widened():
     factors = wider(undisturbed()[0])
     assert factors.min() >= 1.0
     assert np.median(factors) < 1.3
+
+
+def test_stretches_that_agree_have_one_weight():
+    """It is at most 1: without more scatter than noise, nothing has less than its information."""
+    weights = weights_of_stretches(undisturbed()[0])
+    assert weights.max() <= 1.0 and weights.min() > 0.5 * weights.max()
+
+
+def test_a_stretch_that_contradicts_the_others_has_less_weight():
+    """Its images roll though the gyro does not, as with a lens that is stabilised."""
+    source = recorded()
+    tracks = source.tracks
+    angles = 0.004 * np.clip(tracks.frames - 40, 0, 12)  # frames 40 to 52 of 100
+    center = np.array([camera_of(source.truth).cx, camera_of(source.truth).cy])
+    turns = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1)
+    points = center + np.einsum('nij,nj->ni', turns.reshape(-1, 2, 2), tracks.points - center)
+    final, _ = fitted(free_of(EXPOSURE), tracks=dataclasses.replace(tracks, points=points))
+    again, weights = final, np.ones(0)
+    for _ in range(2):
+        weights = weights_of_stretches(again)
+        weighted = final.problem._replace(weight=weights)
+        again = fit(weighted, again.unknowns, final.free)
+    times = final.problem.middles
+    within = (times > 40 / 30 + 0.1) & (times < 52 / 30 - 0.1)
+    beyond = (times < 40 / 30 - 0.35) | (times > 52 / 30 + 0.35)
+    assert weights[within].max() < 0.5 * np.median(weights[beyond])
+    right = undisturbed()[0].unknowns.parameters[model.BIAS]
+
+    def off(one):
+        return np.linalg.norm(one.unknowns.parameters[model.BIAS] - right)
+
+    assert off(again) < 0.85 * off(final)
 
 
 def test_a_fit_that_does_not_converge_has_wider_sigmas():

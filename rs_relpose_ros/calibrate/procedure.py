@@ -203,6 +203,7 @@ def _calibrated(
 
     data, final = following.followed(data, final, refitted, at_end=config.offset_at_end)
     progress(0.7)
+    final = errors.weighted(final)
     final = errors.widened(final, in_images=config.exposed)
     progress(0.8)
     some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
@@ -600,13 +601,25 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     """The calibration without sigmas of claimed parameters that are larger than their priors'.
 
     Widened, sigmas may exceed those of the priors. The information that is then missing is added
-    in these directions alone: the prior does not count twice.
+    in these directions alone: the prior does not count twice. The values move by the correlations
+    of the Hessian: those of few stretches of time have fewer dimensions than there are parameters.
     """
     prior = final.problem.prior
     is_known = knowledge.CLAIMED & final.free & (np.diag(prior) > 0.0)
     known = np.flatnonzero(is_known)
     if not len(known):
         return final.unknowns, covariance
+    off = final.problem.center[known] - final.unknowns.parameters[known]
+    step = _prior_gain(prior, known, errors.shaped(final, covariance)) @ off
+    narrower = _prior_gain(prior, known, covariance) @ covariance[:, known].T
+    return fit.stepped(final.unknowns, step), covariance - narrower
+
+
+def _prior_gain(prior: Array, known: NDArray[np.int64], covariance: Array) -> Array:
+    """Moves (GLOBAL, m) of all parameters by the m known ones' distances from their prior.
+
+    As of a measurement that has the information which `covariance` lacks of that prior.
+    """
     of_known = np.ix_(known, known)
     root = np.linalg.cholesky(np.linalg.inv(prior[of_known]))
     # The covariance in units of the prior, and its axes.
@@ -619,9 +632,7 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     information = (directions * missing) @ directions.T
     own = covariance[:, known]
     reduced = np.eye(len(known)) + own[known] @ information
-    gain = own @ information @ np.linalg.inv(reduced)
-    off = final.problem.center[known] - final.unknowns.parameters[known]
-    return fit.stepped(final.unknowns, gain @ off), covariance - gain @ own.T
+    return np.asarray(own @ information @ np.linalg.inv(reduced))
 
 
 def _against_claims(data: Observations, parameters: Array, covariance: Array) -> str:

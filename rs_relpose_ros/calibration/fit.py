@@ -246,11 +246,12 @@ def evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evalua
     """Add the priors of the pairs' own unknowns, and eliminate these.
 
     With ``H_ll = L L^T``, diagonal times ``1 + damping``, and ``Y = L^-1 [H_lg, g_l]``:
-    ``score = g_g - Y_g^T y_l``, ``reduced = H_gg - Y_g^T Y_g``, ``back = L^-T Y``.
+    ``score = g_g - Y_g^T y_l``, ``reduced = H_gg - Y_g^T Y_g``, ``back = L^-T Y``. Losses, scores
+    and Hessians are times the weights of the pairs, which do not change the pairs' own unknowns.
     """
     weights = _local_priors(problem)
     own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.own[:, 3:]])
-    losses = sums.losses + 0.5 * (weights * own**2).sum(axis=1)
+    losses = problem.weight * (sums.losses + 0.5 * (weights * own**2).sum(axis=1))
     if not sums.gradient.size:
         none = np.zeros((1, LOCAL, problem.pairs))
         return Evaluation(losses, sums.residuals, none[:, 0], none, none, none)
@@ -274,11 +275,13 @@ def evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evalua
     symmetric = lower + np.tril(lower, -1).transpose(0, 2, 1)
     for values in solved:
         solve_upper_groups(factors, values)
+    score = sums.gradient[:, :k] - products[:, :k, k]
+    reduced = symmetric - products[:, :k, :k]
     return Evaluation(
         losses,
         sums.residuals,
-        sums.gradient[:, :k] - products[:, :k, k],
-        symmetric - products[:, :k, :k],
+        problem.weight[:, None] * score,
+        problem.weight[:, None, None] * reduced,
         solved,
         of_own,
     )

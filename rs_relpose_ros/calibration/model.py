@@ -127,6 +127,9 @@ class Problem(NamedTuple):
     turn_sigma: Array  # (P,) 1 sigma of each component of `turn` [rad]
     prior: Array  # (GLOBAL, GLOBAL) information of the parameters before the fit
     center: Array  # (GLOBAL,) their means by the prior
+    # (P,) of the cost of each pair: below 1 where pairs scatter more than their noise. No kernel
+    # reads it.
+    weight: Array
 
     @property
     def pairs(self) -> int:
@@ -161,6 +164,7 @@ class Problem(NamedTuple):
             middle=self.middle[kept],
             bend_sigma=self.bend_sigma[kept],
             turn_sigma=self.turn_sigma[kept],
+            weight=self.weight[kept],
         )
 
 

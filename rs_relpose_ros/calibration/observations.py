@@ -451,6 +451,7 @@ class Observations:
             turn_sigma,
             self._prior(),
             center,
+            np.ones(len(pairs)),
         )
 
     def _prior(self) -> Array:
