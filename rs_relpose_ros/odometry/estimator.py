@@ -98,7 +98,7 @@ _GRAVITY_WINDOW = 1.0
 # Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist, and
 # loops share images. With less, some states are beyond their covariances, with more all are too
 # uncertain. [measured: docs/lab/odometry.md, "Thirty walks"]
-_SHARED = 2.0
+_SHARED = 2.5
 # Innovation of a contradicting pair (chi squared per degree of freedom). A larger gate uses pairs
 # of moving objects, a smaller one rejects right ones: above 4 is one in 800 by chance with 5
 # degrees of freedom, fewer with 11. [derived: chi squared]

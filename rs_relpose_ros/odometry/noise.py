@@ -121,14 +121,14 @@ def noise_of_samples(values: Array, seconds: Array) -> float:
 class NoisePosterior:
     """Noise of accelerometer, gyro and pairs, by a posterior over a grid.
 
-    `accel_errors` and `gyro_errors` are densities beyond the configured ones, `pair_variance` the
-    variance of pairs by the variance of their images.
+    `observed` is the number of innovations, `accel_errors` and `gyro_errors` are densities beyond
+    the configured ones, `pair_variance` is that of pairs by the variance of their images.
     """
 
     def __init__(self) -> None:
         self._prior = _prior(_ACCEL_ERROR_SIGMA, _GYRO_ERROR_HALF)
         self._log = self._prior
-        self._observed = 0
+        self.observed = 0
         self._read()
 
     def expect(self, interval: ImuInterval, imu: ImuConfig) -> None:
@@ -158,7 +158,7 @@ class NoisePosterior:
         remembered = kept * self._log + (1.0 - kept) * self._prior
         worse = log - log.max()
         self._log = remembered + np.maximum(worse, -_ONE_PAIR)
-        self._observed += 1
+        self.observed += 1
         self._read()
 
     def _read(self) -> None:
@@ -177,7 +177,7 @@ class NoisePosterior:
 
     def findings(self, imu: ImuConfig) -> tuple[Finding, ...]:
         """Sensors whose noise is more than twice the configured one for certain."""
-        if self._observed < _LEAST_NAMED:
+        if self.observed < _LEAST_NAMED:
             return ()
         gyro = _noise_finding(
             Code.GYRO_NOISE,
