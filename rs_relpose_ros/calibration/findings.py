@@ -240,8 +240,16 @@ class Assessment:
 
     def is_disturbed_since(self, before: Assessment) -> bool:
         """Whether what was found before may be a trace of a finding that is new since then."""
-        causes = {one.code for one in self.findings} & _DISTURBING
-        return bool(causes - {one.code for one in before.findings})
+        return bool(self._disturbing - before._disturbing)
+
+    @property
+    def _disturbing(self) -> set[Code]:
+        """Findings before which others may have been named in their place."""
+        return {
+            one.code
+            for one in self.findings
+            if one.code in _DISTURBING or one.why is Why.AT_OTHER_TIME
+        }
 
     @property
     def is_gross(self) -> bool:
