@@ -14,9 +14,10 @@ import numpy as np
 
 from rs_relpose_ros.calibrate.result import Estimate, OffsetChanges, StepOfOffset
 from rs_relpose_ros.calibration import fit, model
+from rs_relpose_ros.calibration.changes import Kind
 from rs_relpose_ros.calibration.observations import frames_of, Observations, PairSelection
 from rs_relpose_ros.calibration.offset_course import OffsetCourse, OffsetStep
-from rs_relpose_ros.calibration.trends import change_at, Kind, Trend, trends
+from rs_relpose_ros.calibration.trends import change_at, Trend, trends
 from rs_relpose_ros.core.deviations import OFFLINE
 
 # Chi-square from which a parameter changes within the recording for certain. Less would find a

@@ -210,7 +210,7 @@ def _offset_of(ends: Array, intervals: Array, theta: Array, phi: Array) -> float
     needed = 2.0 * _LOG_LIKELIHOOD / (1.5 * max(counts[best], 1))
     if left[best] > _LEFT_AT_OFFSET or abs(offsets[best]) < _LEAST_OFFSET:
         return None
-    if math.log(rival / max(float(left[best]), 1e-9)) < needed:
+    if rival < math.exp(needed) * max(float(left[best]), 1e-9):
         return None
     return min((float(offsets[best] + fine) for fine in _FINE), key=lambda one: left_at(one)[0])
 

@@ -8,12 +8,12 @@ from these parts without another fit. Its sigma is by the scatter of the blocks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.changes import Kind
 from rs_relpose_ros.calibration.errors import bent, of_few_groups
 from rs_relpose_ros.calibration.fit import Fit
 from rs_relpose_ros.core.least_squares import inverse
@@ -26,13 +26,6 @@ _BLOCK = 0.5
 _BESIDE = 4
 # Blocks below which nothing changes for certain. [chosen: 5 s]
 _FEWEST = 10
-
-
-class Kind(str, Enum):
-    """How a parameter changes."""
-
-    STEP = 'step'
-    DRIFT = 'drift'
 
 
 class Trend(NamedTuple):

@@ -22,7 +22,13 @@ from rs_relpose_ros.estimator import (
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import PARTS, to_reference_row
-from rs_relpose_ros.estimator.result import Diagnostics, landmarks, RelativePose, Status
+from rs_relpose_ros.estimator.result import (
+    Diagnostics,
+    GYRO_CONTRADICTION,
+    landmarks,
+    RelativePose,
+    Status,
+)
 from rs_relpose_ros.estimator.sampling import SolverMode
 from rs_relpose_ros.estimator.sampson import FitMatches, VIEW_1, VIEW_2
 from rs_relpose_ros.estimator.velocity import Refined
@@ -363,7 +369,7 @@ class Estimation:
             return ''
         apart = np.degrees(np.linalg.norm(so3.log_so3(R @ state.R.T)))
         return (
-            f'images and gyro contradict each other: a rotation {apart:.1f} deg from the '
+            f'{GYRO_CONTRADICTION}: a rotation {apart:.1f} deg from the '
             f"gyro's fits the matches better (log-likelihood +{gain:.0f})"
         )
 

@@ -32,6 +32,11 @@ class Status(str, Enum):
     WITHHELD = 'WITHHELD'  # a configured parameter of camera or IMU contradicts the data
 
 
+# Begin of the reason of a pair whose images reject the rotation of the gyro. The odometry, which
+# has the pair as a message, reads it there. [derived: text for people, too]
+GYRO_CONTRADICTION = 'images and gyro contradict each other'
+
+
 def _nan(*shape: int) -> Callable[[], Array]:
     """Maker of an array of NaN, for the default of a field."""
     return lambda: np.full(shape, math.nan)

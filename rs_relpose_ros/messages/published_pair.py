@@ -20,7 +20,7 @@ from rs_relpose_ros.core.losses import robust_scale
 from rs_relpose_ros.core.triangulate import depths_of_rays
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation, IMAGES, POSE, ROTATION
-from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.estimator.result import GYRO_CONTRADICTION, Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
@@ -41,9 +41,6 @@ _MOST_INFORMATION = 1e14
 # Largest speed [baselines/s, rad/s] of a message: above every camera, and its square is far from
 # an overflow. [chosen: 1e4 to 1e100 would do]
 _LARGEST_SPEED = 1e9
-# Begin of the reason of a pair that images and gyro contradict. [derived: as estimator.estimate
-# and pipeline.pipeline give it]
-_GYRO_CONTRADICTION = 'images and gyro contradict each other'
 # Interval that no pair reaches [ns]. [chosen: far above max_keyframe_interval]
 _LONGEST_NS = 100_000_000_000
 
@@ -131,7 +128,7 @@ class PublishedPair:
     @property
     def contradicts_gyro(self) -> bool:
         """Whether it has no pose because images and gyro contradict each other."""
-        return self.images is None and self.reason.startswith(_GYRO_CONTRADICTION)
+        return self.images is None and self.reason.startswith(GYRO_CONTRADICTION)
 
     @property
     def is_pure_rotation(self) -> bool:

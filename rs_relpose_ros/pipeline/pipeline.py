@@ -21,7 +21,7 @@ from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
 from rs_relpose_ros.estimator.pair_problem import PairProblem
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import GYRO_CONTRADICTION, RelativePose, Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.matches import Ids, Matches
@@ -60,9 +60,7 @@ _ROTATION_FRAMES = 3
 # one. [chosen: two a second are enough for a display]
 _UNMATCHED_PERIOD = 0.5
 # Reason for a pair whose images contradict the gyro. [derived: text for people]
-_STEP_SOUGHT = (
-    'images and gyro contradict each other, other than before: a step of a clock is looked for'
-)
+_STEP_SOUGHT = f'{GYRO_CONTRADICTION}, other than before: a step of a clock is looked for'
 # Reason for a pair among others that contradict the gyro. [derived: text for people]
 _CONTRADICTING = 'the images of most of the last pairs contradict the gyro, whatever the cause'
 # Reason for a pair that may follow an object. [derived: text for people]
