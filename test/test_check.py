@@ -612,11 +612,22 @@ REAL = {
 }
 
 
+# The lens of the RealSense by a joint adjustment of four stretches (docs/lab/calibration.md), in
+# place of its CameraInfo, which says that it has no distortion.
+TRUE_LENS = {
+    'camera_matrix': (905.9, 0.0, 636.5, 0.0, 905.9, 356.9, 0.0, 0.0, 1.0),
+    'distortion_coefficients': (0.163, -0.520, 0.0, 0.0, 0.474),
+}
+
+
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', REAL)
 def test_recordings_of_real_cameras(converted, name):
     path = converted(name)
-    findings, report = checked(path, read_parameters(f'{path}.yaml'))
+    parameters = read_parameters(f'{path}.yaml')
+    if name.startswith('realsense'):
+        parameters = parameters.updated(TRUE_LENS)
+    findings, report = checked(path, parameters)
     assert not report.failed
     assert {f.code for f in report.findings if f.state is W} <= REAL[name]
     assert findings['axes'].state in (FindingState.OK, FindingState.UNKNOWN)
@@ -625,6 +636,16 @@ def test_recordings_of_real_cameras(converted, name):
         assert findings['image stamps'].state is FindingState.OK
     if name == 'realsense_rgb_rs_b':
         assert 'time_offset_per_interval' in findings['image stamps'].fix
+
+
+@pytest.mark.recordings
+def test_distortion_that_a_camera_info_denies_is_found(converted):
+    path = converted('realsense_rgb_rs_b')
+    findings, report = checked(path, read_parameters(f'{path}.yaml'))
+    assert {f.code for f in report.findings if f.state is F} == {'distortion'}
+    lens = findings['distortion'].estimated
+    np.testing.assert_allclose(lens, (0.163, -0.520, 0.474), atol=0.12)
+    assert text_of(findings['distortion']).fix.startswith('set distortion_coefficients')
 
 
 @pytest.mark.recordings

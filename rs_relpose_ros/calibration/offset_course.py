@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.core.losses import geman_mcclure_cost
 from rs_relpose_ros.geometry import Array
 
 # Time [s] beside a step whose images are not used, on either side, beyond the step itself. Less
@@ -174,10 +173,9 @@ def _costs(left: Array, path: NDArray[np.int64]) -> Array:
     off = on_path[known] - mean
     noise = max(1.4826 * float(np.median(np.abs(off))), _LEAST_NOISE)
     squares = (((left - mean) / noise) ** 2).sum(axis=2) / _ROBUST**2
-    shape = squares.shape
-    filled = np.where(np.isfinite(squares), squares, np.inf).ravel()
-    losses = np.where(np.isfinite(filled), geman_mcclure_cost(np.minimum(filled, 1e12)), 1.0)
-    return np.asarray(0.5 * _ROBUST**2 / _ALIKE * losses.reshape(shape))
+    # The loss of Geman and McClure, q / (1 + q), which is 1 where nothing is known.
+    losses = 1.0 - 1.0 / (1.0 + np.where(np.isfinite(squares), squares, np.inf))
+    return np.asarray(0.5 * _ROBUST**2 / _ALIKE * losses)
 
 
 def _cheapest(costs: Array) -> tuple[NDArray[np.int64], float]:

@@ -73,6 +73,7 @@ class SecondMotions:
         self._shares: deque[float] = deque(maxlen=_GONE)  # of the object; 0 without one
         self._contradict: deque[bool] = deque(maxlen=_RECENT)  # whether images and gyro do
         self.in_view = False  # whether an object is
+        self.has_come = False  # whether it is since the last pair
 
     def add(self, data: PairData, pose: RelativePose) -> bool:
         """Add a pair with its best pose; whether the pose may be that of an object."""
@@ -80,12 +81,13 @@ class SecondMotions:
         share = second_share(data, pose.inliers)
         self._shares.append(share)
         self._contradict.append(contradicts)
+        self.has_come = False
         if self.in_view:
             self.in_view = any(self._shares)
         else:
             recent = list(self._shares)[-_RECENT:]
             split = sum(share > 0.0 for share in recent)
-            self.in_view = bool(min(split, sum(self._contradict)) >= _IN_VIEW)
+            self.in_view = self.has_come = bool(min(split, sum(self._contradict)) >= _IN_VIEW)
         return self.in_view or (contradicts and share > 0.0)
 
     def finding(self) -> Finding:

@@ -99,7 +99,7 @@ class ConsistencyMonitor:
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self.clock_steps = ClockSteps()
-        self._second_motions = SecondMotions()
+        self.second_motions = SecondMotions()
         self.contradictions = Contradictions()
         self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
         self._drift: Finding | None = None  # that is followed
@@ -116,18 +116,6 @@ class ConsistencyMonitor:
         # Velocities of a wrong configuration are no evidence.
         if not self._wrong_configuration:
             self.acceleration.add(stamp_ns, evidence)
-
-    def follows_object(self, data: posterior.PairData, pose: RelativePose) -> bool:
-        """Whether a pair may follow a moving object: then it is no evidence, and has no pose.
-
-        `pose` is that of the images, also if it contradicts the gyro.
-        """
-        was_in_view = self._second_motions.in_view
-        follows = self._second_motions.add(data, pose)
-        if self._second_motions.in_view and not was_in_view:
-            # Pairs before may have followed it, too.
-            self.restart()
-        return follows
 
     def add_pair(
         self,
@@ -215,10 +203,10 @@ class ConsistencyMonitor:
             except np.linalg.LinAlgError:
                 self._inconsistent = []
             self._compare_directions(due)
-        if self._second_motions.in_view:
+        if self.second_motions.in_view:
             # Rotations by the images are those of the object.
             self.rotations.clear()
-            found_object = self._second_motions.finding()
+            found_object = self.second_motions.finding()
             others = assessment.not_evaluated(set(), found_object.code)
             self.health = Assessment((found_object, *others, *self.image_findings))
             return

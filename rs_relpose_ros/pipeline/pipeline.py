@@ -358,9 +358,12 @@ class Pipeline(Processor[PairResult]):
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
-        follows_object = data is not None and monitor.follows_object(data, fitted)
+        # A pair that may follow a moving object is no evidence, and has no pose.
+        follows_object = data is not None and monitor.second_motions.add(data, fitted)
         if follows_object:
             data = None
+            if monitor.second_motions.has_come:
+                monitor.restart()  # pairs before may have followed it, too
         configured = self._configured(
             frame.applied_offset_ns, frame.imu_doubt.common, since, sensor, parameters
         )
