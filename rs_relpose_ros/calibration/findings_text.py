@@ -378,6 +378,26 @@ def _contradicting(finding: Finding) -> Text:
     )
 
 
+# What to do about a map of residuals that has a pattern, by its name. [derived: text for people]
+_OF_MAP = {
+    'cells': 'compare the CameraInfo with the images (cropped, resized, another lens), and mask '
+    'what moves with the camera; run "rs_relpose calibrate --lens"',
+    'rows_rate': 'verify readout_time and readout_direction: run "rs_relpose calibrate"',
+    'time': 'have both sensors stamped by one clock, and fix zoom and focus',
+    'halves': 'run "rs_relpose calibrate", and compare its values with the parameters',
+}
+
+
+def _pattern(finding: Finding) -> Text:
+    measured = finding.evidence.measured
+    candidates = ', '.join(code.value for code in finding.candidates) or 'not known'
+    return Text(
+        f'residuals have a pattern that no parameter explains (map {measured["map"]}, '
+        f'p {measured["p"]:.1g}: {measured["worst"]}); candidates: {candidates}',
+        _OF_MAP[measured['map']],
+    )
+
+
 def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
@@ -407,6 +427,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.FOCAL_DRIFT, Why.DRIFTING): _focal_drift,
     (Code.UNKNOWN_CAUSE, Why.UNEXPLAINED): _unknown_cause,
     (Code.UNKNOWN_CAUSE, Why.CONTRADICTING): _contradicting,
+    (Code.UNKNOWN_CAUSE, Why.RESIDUALS): _pattern,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
     (Code.KNOCK, Why.OFF): _knock,

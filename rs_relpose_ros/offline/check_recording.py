@@ -29,6 +29,7 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
+from rs_relpose_ros.calibration.residual_maps import maps_of, PairSums, with_maps
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -427,7 +428,9 @@ def sampled(
     poseless, matches, poses = ReasonCounts(), list[int](), 0
     frames = part_since_ns = last_ns = 0
     before = findings.NOT_EVALUATED  # of the settled parts
-    for outcome in outcomes(front_end, Intake(front_end.sequencer, parameters), chosen):
+    intake = Intake(front_end.sequencer, parameters)
+    sums: list[PairSums] = []
+    for outcome in outcomes(front_end, intake, chosen):
         if isinstance(outcome, MessageRefused):
             unused.add(str(outcome.error))
             continue
@@ -439,6 +442,7 @@ def sampled(
         if (pair := outcome.result) is None:
             continue
         poses += bool(pair.pose)
+        sums += pair.residual_sums(intake.intrinsics)
         if not pair.pose:
             poseless.add(pair.pose.reason)
         if not matches or not 0 <= pair.stamp_ns - last_ns < _APART_NS:
@@ -447,7 +451,7 @@ def sampled(
             before = findings.worst_of(before, front_end.health)
         matches.append(len(pair.matches))
         last_ns = pair.stamp_ns
-    health = findings.worst_of(before, front_end.health)
+    health = with_maps(findings.worst_of(before, front_end.health), maps_of(sums))
     is_refused = frames < _FEW_USED * counts['handed']
     return Sample(frames, matches, poses, poseless if matches else unused, health, is_refused)
 

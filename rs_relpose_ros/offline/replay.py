@@ -22,6 +22,13 @@ from rs_relpose_ros.bags.sensor_topics import SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import summary_json, summary_lines
+from rs_relpose_ros.calibration.residual_maps import (
+    maps_of,
+    PairSums,
+    ResidualMap,
+    summary_line,
+    with_maps,
+)
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -206,10 +213,11 @@ class ReplayOutcome:
     health: Assessment  # the worst finding of each configured parameter
     files: list[Path]  # written so far: tables, bag and pictures
     intrinsics: Intrinsics | None  # active at the end
+    maps: tuple[ResidualMap, ...] = ()
 
     def health_lines(self) -> list[str]:
         """Lines on the calibration for the console."""
-        return summary_lines(self.health)
+        return [*summary_lines(self.health), *filter(None, [summary_line(self.maps)])]
 
 
 def replay_into(
@@ -235,6 +243,7 @@ def replay_into(
         refuse_existing(out_bag)
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE, *PICTURES))
     records: list[PairRecord] = []
+    sums: list[PairSums] = []
     shown: PairResult | None = None
     last = None
     health = NOT_EVALUATED
@@ -246,6 +255,7 @@ def replay_into(
         for pair in run.pairs():
             records.append(PairRecord.of(pair, truth))
             last = pair
+            sums += pair.residual_sums(run.intake.intrinsics)
             health = worst_of(health, pair.health)
             write_record(records[-1])
             if writer is not None:
@@ -258,16 +268,18 @@ def replay_into(
             if pictures and (shown is None or rank > best):
                 shown = pair
                 best = rank
-    health = worst_of(health, run.health)
+    maps = maps_of(sums)
+    health = with_maps(worst_of(health, run.health), maps)
     files = [folder / table.file for table in written] + [out_bag] * with_bag
     if shown is not None:
         # Imports Matplotlib, which takes a second.
         from rs_relpose_ros.offline.pictures import draw_replay
 
         files += draw_replay([folder / name for name in PICTURES], records, shown, truth)
-    return ReplayOutcome(
-        records, _summary(records, run, last, health), health, files, run.intake.intrinsics
-    )
+    summary = _summary(records, run, last, health) | {
+        'residual_maps': [one.as_json() for one in maps]
+    }
+    return ReplayOutcome(records, summary, health, files, run.intake.intrinsics, maps)
 
 
 def _summary(

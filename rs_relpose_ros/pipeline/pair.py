@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED
+from rs_relpose_ros.calibration.residual_maps import PairSums, View
 from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
@@ -215,6 +216,21 @@ class PairResult:
     def applied(self) -> Applied:
         """Corrections of the next frames, which follow from the tracked calibration."""
         return self.lesson().applied
+
+    def residual_sums(self, intrinsics: Intrinsics | None) -> list[PairSums]:
+        """What the pair adds to the maps of residuals; empty without a pose."""
+        if intrinsics is None or not self.pose:
+            return []
+        view = View(intrinsics.image_width, intrinsics.image_height, self.readout_axis)
+        found = PairSums.of(
+            self.stamp_ns,
+            self.matches,
+            self.pose,
+            intrinsics.fx,
+            view,
+            self.images_against_gyro,
+        )
+        return [] if found is None else [found]
 
     @property
     def gyro_difference(self) -> float:

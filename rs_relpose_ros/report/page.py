@@ -13,6 +13,7 @@ import cv2
 
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibration.findings import Finding, FindingState
+from rs_relpose_ros.calibration.residual_maps import FAILS_BELOW
 from rs_relpose_ros.messages.outgoing import draw_pair
 from rs_relpose_ros.offline import tables
 from rs_relpose_ros.offline.check_report import Line
@@ -133,8 +134,10 @@ def _sections(observation: Observation, write: _Writer, images: bool) -> Iterabl
     yield Section('imu', 'Gyro and accelerometer', _drawings(plots.inertial(observation), write))
     clock = [] if rates is None else plots.clock(rates)
     yield Section('clock', 'Images against gyro', _drawings(clock, write))
-    maps = _drawings(plots.residual_maps(observation), write)
-    yield Section('residuals', 'Residuals', maps and f'<p>{_RESIDUALS}</p>{maps}')
+    drawn = _drawings(plots.residual_maps(observation), write)
+    tests = _residual_tests(observation, write)
+    residuals = drawn and f'<p>{_RESIDUALS}</p>{drawn}{tests}'
+    yield Section('residuals', 'Residuals', residuals)
     yield Section('calibration', 'Calibration', _calibration(observation, write))
     yield Section('pairs', 'Pairs', _pairs(observation, write))
     if images:
@@ -147,6 +150,28 @@ _RESIDUALS = (
     'Distances of the matches from what rotation, velocity and readout of their pair predict: '
     'root mean square of the inliers, in pixels at the image centre.'
 )
+
+# What the table below them shows.
+_TESTS = (
+    'Sums of the signed residuals in cells are zero on the average where all parameters are '
+    f'right: p below {FAILS_BELOW:g} is a pattern.'
+)
+
+
+def _residual_tests(observation: Observation, write: _Writer) -> str:
+    """The maps of signed residuals as a table; empty without a cell that counts."""
+    known = [one for one in observation.maps if one.tested]
+    if not known:
+        return ''
+    rows = ''.join(
+        f'<tr><td>{write.text(one.name)}</td><td class="number">{one.p:.1g}</td>'
+        f'<td>{write.text(one.labels[one.worst])}</td></tr>'
+        for one in known
+    )
+    return (
+        f'<p>{_TESTS}</p><table><tr><th>map</th><th>p</th><th>least probable cell</th></tr>'
+        f'{rows}</table>'
+    )
 
 
 def _overview(observation: Observation, write: _Writer) -> str:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.residual_maps import signed_residuals
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.pipeline.pair import PairResult
@@ -55,22 +56,9 @@ class MatchResiduals:
 def epipolar_residuals(pair: PairResult, focal_length: float) -> Array:
     """Distances (N,) [px] of the matches from the epipolar constraint of their rows.
 
-    First order (Sampson), in pixels at the image centre: with the baseline
-    ``b = t + tau_2 R v_2 - tau_1 v_1`` between the places of the camera at both rows,
-    ``|f_1 . (b x R f_2)|`` over the length of its gradient by both images.
+    First order (Sampson), in pixels at the image centre.
     """
-    pose, matches = pair.pose, pair.matches
-    first = matches.rays[0]
-    second = matches.rays[-1] @ pose.R.T
-    velocity_2 = pose.R @ pose.linear_velocity2
-    moved_1 = np.outer(matches.row_times[0], pose.linear_velocity1)
-    moved_2 = np.outer(matches.row_times[-1], velocity_2)
-    baselines = pose.t + moved_2 - moved_1
-    normal = np.cross(baselines, second)
-    value = np.einsum('ij,ij->i', first, normal)
-    by_first = np.linalg.norm(normal - value[:, None] * first, axis=1)
-    by_second = np.linalg.norm(np.cross(baselines, first), axis=1)
-    return focal_length * np.abs(value) / np.hypot(by_first, by_second)
+    return focal_length * np.abs(signed_residuals(pair.pose, pair.matches).values)
 
 
 class Cells(NamedTuple):

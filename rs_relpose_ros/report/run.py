@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.sensor_topics import Chosen, SensorTopics
 from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED, worst_of
+from rs_relpose_ros.calibration.residual_maps import (
+    maps_of,
+    PairSums,
+    ResidualMap,
+    with_maps,
+)
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
@@ -104,6 +110,7 @@ class Observation:
     rotations: tuple[Rotation, ...] = ()
     shown: tuple[PairResult, ...] = ()
     health: Assessment = NOT_EVALUATED
+    maps: tuple[ResidualMap, ...] = ()  # of their signed residuals
     unused: dict[str, int] = field(default_factory=dict)  # frames and messages by reason
 
 
@@ -201,6 +208,8 @@ class _Run:
         self._rotations: dict[int, Rotation] = {}
         self.records: list[PairRecord] = []
         self.residuals: list[MatchResiduals] = []
+        self._sums: list[PairSums] = []
+        self.maps: tuple[ResidualMap, ...] = ()
         self.withheld = self.frames = 0
         self.health = NOT_EVALUATED
         self.unused = ReasonCounts()
@@ -223,6 +232,8 @@ class _Run:
             if outcome.result is not None:
                 yield self._kept(outcome.result)
         self._note_health(self._front_end.health)
+        self.maps = maps_of(self._sums)
+        self.health = with_maps(self.health, self.maps)
 
     def _noted(
         self, source: Iterable[tuple[Role, BagMessage]]
@@ -239,6 +250,7 @@ class _Run:
         self.records.append(PairRecord.of(replace(pair, image2=None), self.truth))
         if pair.pose:
             self.residuals.append(MatchResiduals.of(pair, self._focal_length))
+            self._sums += pair.residual_sums(self.intake.intrinsics)
         else:
             self._poseless.add(pair.pose.reason)
         self._note_health(pair.health)
@@ -280,6 +292,7 @@ class _Run:
             rotations=self.rotations,
             shown=self.shown,
             health=self.health,
+            maps=self.maps,
             unused=dict(self.unused.most_common()),
         )
 
