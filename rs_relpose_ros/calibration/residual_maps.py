@@ -53,8 +53,13 @@ _BLOCK = 2.0
 # Time of the pairs that make one observation [s]. Without it, tracks that last for several pairs
 # count as independent, and a bias of one of them is taken for one of the camera; longer groups
 # are few. [measured: with pairs alone a recording of a RealSense has 1e-9 where half a second has
-# 3e-4; a correct walk has 3e-4 at least with either]
+# 3e-4]
 _GROUP = 0.5
+# Bias of all residuals of a cell that a tracker makes [sigmas of a residual], as 1 sigma. Without
+# it correct recordings would fail that are long, or of a plane; a larger one would hide errors of
+# the readout. [measured: of halves of a correct plane that fills the view the mean is 0.041, and
+# p is 3e-6 without and 4e-3 with it; with 0.03 a readout that is off by 2 ms hardly fails]
+_TRACKER_BIAS = 0.02
 # Fewest observations of a cell. With fewer the scatter itself is noise. [chosen: 6 to 12 would do]
 _FEWEST_GROUPS = 8
 # Fewest pairs of a block of time, whose scatter is that of all blocks. [chosen: 2 to 6 would do]
@@ -272,7 +277,8 @@ def map_by_groups(
 ) -> ResidualMap:
     """The map of sums (P, M) over P pairs, each in one of the `groups` (P,), from 0 on.
 
-    A group is one observation of a cell, and their scatter about its mean the variance.
+    A group is one observation of a cell, and their scatter about its mean the variance, together
+    with the bias of a tracker.
     """
     total, number = sums.sum(axis=0), counts.sum(axis=0)
     left = sums - counts * (total / np.maximum(number, 1.0))
@@ -283,7 +289,8 @@ def map_by_groups(
     observed = (present > 0.0).sum(axis=0)
     variance = (by_group**2).sum(axis=0) * observed / np.maximum(observed - 1, 1)
     known = (observed >= _FEWEST_GROUPS) & (variance > 0.0)
-    sigmas = np.where(known, np.sqrt(variance), math.nan)
+    with_bias = np.sqrt(variance + (_TRACKER_BIAS * number) ** 2)
+    sigmas = np.where(known, with_bias, math.nan)
     return _assessed(name, labels, (total, number), sigmas, observed - 1)
 
 
