@@ -35,7 +35,7 @@ from rs_relpose_ros.calibration.posterior import pair_information, PairData, Pos
 from rs_relpose_ros.calibration.rotations import AccelerationSums, rotation_of_rays, RotationSums
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
-from rs_relpose_ros.core.deviations import LENS, LIVE, N_DEVIATIONS, PARTS
+from rs_relpose_ros.core.deviations import ASPECT_SIGMA, LENS, LIVE, N_DEVIATIONS, PARTS
 from rs_relpose_ros.core.radial import corner_radius, displacements, independent_shapes
 from rs_relpose_ros.core.rows import row_states, RowStates
 from rs_relpose_ros.estimator import sampson
@@ -64,7 +64,7 @@ from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 AXES, BIAS = LIVE.part('axes'), LIVE.part('gyro_bias')
 OFFSET, READOUT = LIVE.index('time_offset'), LIVE.index('readout_time')
 SCALE, SKEW = LIVE.part('gyro_scale'), LIVE.part('gyro_skew')
-FOCAL = LIVE.index('focal_log')
+FOCAL, ASPECT = map(LIVE.index, ('focal_log', 'aspect'))
 DISTORTION = LIVE.part('distortion')
 CENTER = LIVE.part('principal_point')
 DEVIATIONS = LIVE.size
@@ -85,14 +85,14 @@ CAMERA = RollingShutterCamera(
 PARAMETERS = Parameters.from_mapping(
     {'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())}
 )
-# Small deviations: rad, s, s, rad/s, -, rad, -, shapes of the lens, widths.
+# Small deviations: rad, s, s, rad/s, -, rad, -, -, shapes of the lens, widths.
 SMALL = np.array(
     [3e-3] * 3
     + [2e-3, 2e-3]
     + [3e-3] * 3
     + [5e-3] * 3
     + [5e-3] * 3
-    + [0.01]
+    + [0.01, 0.01]
     + [0.01, 0.02, 0.02]
     + [3e-3] * 2
 )
@@ -150,7 +150,7 @@ def deviating(camera, c):
     signed = camera.line_delay * camera.height + c[READOUT]
     coefficients = independent_shapes(corner_radius(camera)) @ c[DISTORTION]
     center = camera.width * c[CENTER]
-    lens = np.concatenate([[c[FOCAL], 0.0], coefficients, center])
+    lens = np.concatenate([[c[FOCAL], c[ASPECT]], coefficients, center])
     return replace(
         camera.moved_lens(lens),
         readout_time=abs(signed),
@@ -186,8 +186,9 @@ def pair_data(start, end, c, camera=CAMERA):
     )
 
 
-def flight(c, pairs=9, camera=CAMERA):
-    return [pair_data(0.4 * k, 0.4 * k + 0.3, c, camera) for k in range(pairs)]
+def flight(c, pairs=9, camera=CAMERA, start=0.0):
+    begins = start + 0.4 * np.arange(pairs)
+    return [pair_data(begin, begin + 0.3, c, camera) for begin in begins]
 
 
 def solved(pairs, active, about):
@@ -209,13 +210,13 @@ def test_pairs_are_exact_at_times_that_are_far_off():
 
 @pytest.mark.parametrize(
     'signs',
-    [*np.eye(DEVIATIONS), [0.5, -0.5, 0.5, 0.5, -0.5] * 4],
+    [*np.eye(DEVIATIONS), [0.5, -0.5, 0.5] * 7],
     ids=[*map(str, range(DEVIATIONS)), 'all'],
 )
 def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
     """Noise-free; about the solution again, since a pair is not linear in it."""
     c = SMALL * signs
-    pairs = flight(c, 14)
+    pairs = flight(c, 14, start=0.1)
     first = solved(pairs, NONE, NONE)
     found = solved(pairs, NONE, solved(pairs, NONE, first))
     # Shaking within a readout is known to first order only, which bias and lens do not rotate.
@@ -350,6 +351,7 @@ MOVING = {
     'gyro_scale': [0.01, 0.01, 0.01],
     'gyro_skew': [2e-3, -2e-3, 2e-3],
     'focal_log': -0.005,
+    'aspect': -0.005,
     'distortion': [3e-3, -0.02, 0.02],
     'principal_point': [2e-3, -2e-3],
 }
@@ -768,7 +770,7 @@ SIGMA = np.array(
     + [1e-3] * 3
     + [5e-3] * 3
     + [1e-3] * 3
-    + [5e-3]
+    + [5e-3] * 2
     + [0.01] * 3
     + [1e-3] * 2
 )
@@ -776,6 +778,8 @@ SIGMA = np.array(
 EFFECT = assessment.Effect(
     *(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6))
 )
+# Five sigmas of each deviation do, and no two of them cancel.
+EACH = assessment.Effect(np.diag(0.2 / SIGMA), np.diag(0.2 / SIGMA))
 
 
 def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
@@ -879,6 +883,45 @@ def test_distortion_of_a_lens_that_is_given_without_is_named_by_pairs():
     np.testing.assert_allclose(faults[0].estimated, off, atol=3.0 * faults[0].sigma)
 
 
+@pytest.mark.parametrize(
+    'wrong, named',
+    [
+        # Columns or rows were resized, and then the camera zoomed, too.
+        ({'focal_log': -0.1, 'aspect': 0.1}, 'aspect'),
+        ({'aspect': 0.1}, 'aspect'),
+        ({'focal_log': 0.2, 'aspect': 0.1}, 'aspect'),
+        ({'focal_log': 0.1}, 'focal_length'),
+    ],
+)
+def test_squeezed_images_are_named_with_both_focal_lengths(wrong, named):
+    """And those of a wrong focal length are not."""
+    c = deviation(**wrong)
+    (found,) = assessment.find_inconsistencies(calibration(c, SIGMA), [EACH], CONFIGURED)
+    np.testing.assert_allclose(found.deviation, c, atol=1e-3)
+    (fault,) = assessed(calibration(c, SIGMA), EACH).faults
+    assert fault.code == named
+    right = CAMERA.moved_lens(np.array([c[FOCAL], c[ASPECT], *np.zeros(5)]))
+    lengths = (right.fx, right.fy) if named == 'aspect' else (right.fx,)
+    np.testing.assert_allclose(fault.estimated, lengths, rtol=1e-3)
+    assert ('the images are squeezed' in text_of(fault).fix) is (named == 'aspect')
+
+
+@pytest.mark.parametrize('squeeze', [0.95, 1.05, 1.0])
+def test_squeezed_images_are_named_by_pairs(squeeze):
+    c = deviation(focal_log=math.log(squeeze), aspect=-math.log(squeeze))
+    rng, sums = np.random.default_rng(4), Posterior()
+    for k in range(12):
+        pair = pair_data(0.4 * k, 0.4 * k + 0.3, c)
+        noise = 0.3 * rng.normal(size=(2, *pair.points1.shape))
+        pair = replace(pair, points1=pair.points1 + noise[0], points2=pair.points2 + noise[1])
+        assert sums.add(400 * MS * k, pair, NONE, NONE) is not None
+    faults = assessed(sums.solved(), EACH).faults
+    assert [fault.code for fault in faults] == ([] if squeeze == 1.0 else ['aspect'])
+    for fault in faults:
+        right = squeeze * CAMERA.fx, CAMERA.fy
+        np.testing.assert_allclose(fault.estimated, right, atol=3.0 * fault.sigma)
+
+
 def test_configured_sigma_of_the_lens_is_that_of_what_it_does_to_the_image():
     """All three coefficients are uncertain, by the displacement of the stated sigma of k1."""
     sigmas = assessment.configured_sigmas(
@@ -920,10 +963,12 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
             assessment.undetermined(posterior.NOTHING_ESTIMATED, replace(CONFIGURED, sigmas=small))
         )
     )
+    # A camera whose focal length is known has square pixels.
+    assert small[ASPECT] == ASPECT_SIGMA
     given = [0, 1, 2, OFFSET, READOUT, *range(FOCAL, DEVIATIONS)]
     np.testing.assert_allclose(doubt[given], small[given])
-    # Of eight quantities two are not known: the odds are 2 to 8 that one of them is off.
-    np.testing.assert_allclose(doubt[SCALE], math.sqrt(2 / 10) * LIVE.sigmas[SCALE])
+    # Of nine quantities two are not known: the odds are 2 to 9 that one of them is off.
+    np.testing.assert_allclose(doubt[SCALE], math.sqrt(2 / 11) * LIVE.sigmas[SCALE])
 
 
 @pytest.mark.parametrize('size, row', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])
@@ -1230,6 +1275,8 @@ WRONG_ONES = [
     ),
     Wrong('gyro 0.95', 'gyro_scale', (), imu_with(gyro=1.0 / 0.95), 0.95, 3e-3, pairs=14),
     Wrong('K 1.3', 'focal_length', (), camera_with(fx=1.3, fy=1.3), 450.0, 5.0, pairs=12),
+    Wrong('squeezed to 0.9', 'aspect', (), camera_with(fx=1.0 / 0.9), 450.0, 5.0, pairs=20),
+    Wrong('stretched by 1.2', 'aspect', (), camera_with(fy=1.0 / 1.2), 450.0, 5.0, pairs=20),
     Wrong('acceleration, other sign', 'accel_axes', (), imu_with(force=-UNCHANGED), pairs=20),
 ]
 

@@ -124,6 +124,13 @@ def _focal_length(factor: float) -> Change:
     )
 
 
+def _squeezed(factor: float) -> Change:
+    """The columns of the images are `factor` times as many as those of the CameraInfo."""
+    return lambda right, rng: replace(
+        right, intrinsics=replace(right.intrinsics, fx=right.intrinsics.fx / factor)
+    )
+
+
 def _center(right: float, down: float) -> Change:
     """The configured principal point is off, as of images that were cropped."""
     return lambda configured, rng: replace(
@@ -288,6 +295,7 @@ ROWS: Mapping[str, Row] = {
     ),
     'gyro-0.95': Row(('gyro_scale',), SMALL, _gyro_times(0.95), _error('gyro_scale', 0.05)),
     'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97), _error('focal_length', 0.03)),
+    'squeezed-0.9': Row(('aspect',), SMALL, _squeezed(0.9)),
     'center-36-left': Row(('principal_point',), SMALL, _center(36.0, 0.0)),
     'center-20-top': Row(('principal_point',), SMALL, _center(0.0, 20.0)),
     'mirrored': Row(('image_geometry',), SMALL, _shown(MIRRORED)),

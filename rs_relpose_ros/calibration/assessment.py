@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from rs_relpose_ros.calibration.findings import (
 from rs_relpose_ros.calibration.posterior import Calibration, OF_LENS
 from rs_relpose_ros.calibration.rotations import RotationComparison
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.deviations import ASPECT_SIGMA, LIVE
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.core.radial import corner_radius, displacements, independent_sigmas
 from rs_relpose_ros.geometry import Array
@@ -134,6 +135,8 @@ def configured_sigmas(
         corner_radius(camera), configured['distortion']
     )
     sigmas[LIVE.part('principal_point')] /= camera.width
+    if configured['focal_log']:
+        sigmas[LIVE.part('aspect')] = ASPECT_SIGMA
     by_interval = from_reference * sensor.time_offset_per_interval_sigma
     offset = LIVE.index('time_offset')
     sigmas[offset] = math.hypot(sigmas[offset], by_interval, offset_sigma)
@@ -180,13 +183,13 @@ def find_inconsistencies(
     while len(found) < _MOST_QUANTITIES:
         if selected.any() or ranked is None:
             ranked = _ranked(
-                [one for one in findings.QUANTITIES if not selected[one.part].any()],
+                [one for one in findings.QUANTITIES if not selected[one.own].any()],
                 selected,
                 estimated,
                 configured,
             )
         (quantity, solution), (second, other) = ranked[:2]
-        if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
+        if (certainty := solution.certainty(quantity.own)) < _CERTAIN:
             break
         needed = _CLEARLY if quantity.alone or second.alone else _AS_GOOD
         lead = solution.evidence(quantity) - other.evidence(second)
@@ -196,7 +199,8 @@ def find_inconsistencies(
             if quantity.alone:
                 break
         elif not found and 0.0 <= lead < needed:
-            alternative = _inconsistency(second, other, other.certainty(second.part), effects)
+            alternative = _inconsistency(second, other, other.certainty(second.own), effects)
+        found = [one for one in found if one[0].entry != quantity.beside]
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
     inconsistent = [
@@ -236,7 +240,7 @@ def _ranked(
 
     def rank(hypothesis: Hypothesis) -> tuple[bool, float]:
         quantity, solution = hypothesis
-        is_certain = solution.certainty(quantity.part) >= _CERTAIN
+        is_certain = solution.certainty(quantity.own) >= _CERTAIN
         return not is_certain, -solution.evidence(quantity)
 
     unordered = [
@@ -289,7 +293,7 @@ def undetermined(
     estimated = replace(estimated, shared=1.0)
     for quantity in findings.QUANTITIES:
         part = quantity.part
-        if not known[part].any():
+        if not known[quantity.own].any():
             solution = _solved(_parts_of(quantity), estimated, configured)
             covariance = np.ascontiguousarray(solution.covariance[part, part])
             gain = min(
@@ -301,7 +305,7 @@ def undetermined(
             odds += own_odds
             if quantity.alone:
                 alone += own_odds * solution.moment
-                together[part] = False
+                together[quantity.own] = False
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[LIVE.part('gyro_bias')] = within[:, LIVE.part('gyro_bias')] = 0.0
@@ -315,7 +319,7 @@ def undetermined(
 
 def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
     """Which deviations (K,) are those of a quantity."""
-    return LIVE.mask(quantity.entry)
+    return LIVE.mask(quantity.entry, quantity.beside or quantity.entry)
 
 
 class Solution(NamedTuple):
@@ -368,9 +372,12 @@ class Solution(NamedTuple):
         """Chi-square in favour of a quantity.
 
         What a deviation of the lens explains in each pair for itself gains as well, and counts as
-        far as the pairs agree.
+        far as the pairs agree. A quantity that is not needed besides another one has no more than
+        what its own entry gains.
         """
         part = quantity.part
+        if quantity.beside and self.certainty(quantity.own) < _CERTAIN:
+            part = quantity.own
         return self.certainty(part) ** 2 if quantity.entry in OF_LENS else self.gain(part)
 
     def certainty(self, part: slice) -> float:
@@ -385,9 +392,10 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
     if free.any():
         factors = estimated.if_free[:, free].max(axis=1)
-        estimated = replace(
-            estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
-        )
+        if (factors != 1.0).any():
+            estimated = replace(
+                estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
+            )
     S, misfit = estimated.S.sum(axis=0), estimated.scatter * estimated.shared
     # Scaled: the deviations have different units.
     scale = np.outer(sigmas, sigmas)
@@ -738,14 +746,7 @@ def unexplained(estimated: Calibration, *, is_named: bool = False) -> Finding | 
     count = len(estimated.b)
     if count < (_FEWEST_IF_NAMED if is_named else _FEWEST_PAIRS):
         return None
-    # Scaled by the prior: the deviations have different units.
-    information = estimated.S * np.outer(LIVE.sigmas, LIVE.sigmas)
-    scores = (estimated.b - estimated.S @ estimated.c) * LIVE.sigmas
-    with_prior = information + np.eye(LIVE.size)
-    whitened = np.linalg.solve(with_prior, np.dstack([scores, information]))
-    squares = (scores * whitened[:, :, 0]).sum(axis=1)
-    freedom = np.trace(whitened[:, :, 1:], axis1=1, axis2=2)
-    ratio = float(np.median(squares / freedom))
+    ratio = _disagreement(estimated)
     if ratio < _LARGEST_CHI_SQUARE:
         return None
     return Finding(
@@ -755,3 +756,16 @@ def unexplained(estimated: Calibration, *, is_named: bool = False) -> Finding | 
         evidence=Evidence(pairs=count, measured={'chi_square_per_freedom': ratio}),
         candidates=_CANDIDATES,
     )
+
+
+@functools.lru_cache(maxsize=1)
+def _disagreement(estimated: Calibration) -> float:
+    """Median of the pairs' chi-square per degree of freedom; kept, as it is asked for twice."""
+    # Scaled by the prior: the deviations have different units.
+    information = estimated.S * np.outer(LIVE.sigmas, LIVE.sigmas)
+    scores = (estimated.b - estimated.S @ estimated.c) * LIVE.sigmas
+    with_prior = information + np.eye(LIVE.size)
+    whitened = np.linalg.solve(with_prior, np.dstack([scores, information]))
+    squares = (scores * whitened[:, :, 0]).sum(axis=1)
+    freedom = np.trace(whitened[:, :, 1:], axis1=1, axis2=2)
+    return float(np.median(squares / freedom))

@@ -60,6 +60,7 @@ class Code(str, Enum):
     GYRO_BIAS = 'gyro_bias'
     GYRO_SCALE = 'gyro_scale'
     FOCAL_LENGTH = 'focal_length'
+    ASPECT = 'aspect'
     DISTORTION = 'distortion'
     PRINCIPAL_POINT = 'principal_point'
     # Further causes that the consistency monitor names.
@@ -317,7 +318,7 @@ class Quantity(NamedTuple):
     """A parameter of camera or IMU that images and gyro determine."""
 
     code: Code
-    entry: str  # name of its deviation in `LIVE`
+    entry: str  # name of its deviation in `LIVE`, the last of them if `beside` names another
     observable: float  # largest `uncertainty` with which the deviation counts as observable
     # Unit of the values of a finding. Deviations are in rad where this is deg.
     unit: str
@@ -330,19 +331,27 @@ class Quantity(NamedTuple):
     relative: float = 0.0
     # Whether it is off alone, if at all: with others free it could cancel their effect.
     alone: bool = False
-    # Shapes (m, m) of a lens whose deviation is not that of its coefficients: coefficients by the
-    # deviation. Then `value` takes the change of the coefficients.
+    # Shapes (m, m) of a lens whose deviation is not that of its values: coefficients, or the
+    # logarithms of both focal lengths, by the deviation. `value` takes the change of these then.
     shapes: Callable[[Configured], Array] | None = None
     # Size of the sigmas, by the covariance (m, m) of the deviation.
     uncertainty: Callable[[Configured, Array], float] = lambda configured, covariance: math.sqrt(
         float(np.diag(covariance).max())
     )
+    # Entry just before its own that may be off with it: the hypothesis that this quantity is off
+    # frees both, and is certain as far as its own entry is needed besides the other one.
+    beside: str = ''
     tracking: str = ''  # name of the parameter that lets the node track the quantity
     reach: float = 0.0  # largest deviation that tracking applies
 
     @property
     def part(self) -> slice:
         """Places of its deviations in a vector of `LIVE`."""
+        return slice(LIVE.part(self.beside or self.entry).start, self.own.stop)
+
+    @property
+    def own(self) -> slice:
+        """Places of the deviations that no other quantity has."""
         return LIVE.part(self.entry)
 
     def unknown(self, why: Why, parent: Code | None = None) -> Finding:
@@ -364,6 +373,15 @@ COMPARED = 'estimated {}, active {}'
 
 def _focal_length(configured: Configured, left: Array) -> Array:
     return np.asarray(configured.camera.fx * np.exp(left))
+
+
+def _focal_lengths(configured: Configured, left: Array) -> Array:
+    return np.asarray((configured.camera.fx, configured.camera.fy) * np.exp(left))
+
+
+def _logarithms(configured: Configured) -> Array:
+    """Logarithms of fx and fy by those of the focal length and the aspect, for any camera."""
+    return np.array([[1.0, 0.0], [1.0, 1.0]])
 
 
 def _coefficients(configured: Configured, left: Array) -> Array:
@@ -474,6 +492,25 @@ QUANTITIES = (
         _focal_length,
         lambda configured, estimated: estimated,
         relative=1.0,
+    ),
+    Quantity(
+        Code.ASPECT,
+        'aspect',
+        0.04,
+        'px',
+        Shown(
+            'px',
+            1.0,
+            1,
+            'fx, fy: ' + COMPARED,
+            'calibrate the camera at this resolution; the images are squeezed',
+        ),
+        _focal_lengths,
+        lambda configured, estimated: estimated,
+        relative=1.0,
+        alone=True,
+        shapes=_logarithms,
+        beside='focal_log',
     ),
     Quantity(
         Code.DISTORTION,

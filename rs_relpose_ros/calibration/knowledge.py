@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from rs_relpose_ros.calibration import model
-from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.core.deviations import ASPECT_SIGMA, OFFLINE
 from rs_relpose_ros.core.radial import corner_radius, prior_covariance
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -33,8 +33,6 @@ class LensKnowledge(str, Enum):
 # a larger one would leave weak recordings without a scale of the rotation.
 # [chosen: what a calibration by a target leaves]
 _FOCAL_SIGMA = 0.005
-# 1 sigma of the ratio fy / fx. [chosen: pixels are square; any value in 0.001..0.005 would do]
-_ASPECT_SIGMA = 0.002
 # 1 sigma of a claimed principal point, as a share of the longer side of the image. A smaller one
 # would put the errors of a principal point on the axes. [chosen: as that of the focal length]
 _CLAIMED_CENTER_SIGMA = 0.005
@@ -85,7 +83,7 @@ def prior_information(
     sigmas[model.SLOPE] = _SLOPE_SIGMA
     sigmas[model.SCALE] = _SCALE_SIGMA
     sigmas[model.SKEW] = _SKEW_SIGMA
-    sigmas[model.ASPECT] = _ASPECT_SIGMA
+    sigmas[model.ASPECT] = ASPECT_SIGMA
     of_center = _CENTER_SIGMA
     if lens is LensKnowledge.CLAIMED:
         sigmas[model.FOCAL] = _FOCAL_SIGMA

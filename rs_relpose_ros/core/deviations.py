@@ -54,14 +54,19 @@ ENTRIES = (
     Entry('exposure_square', 1, 's^2', 1e-4, 1e-3),
     # The next four are those of `geometry.lens`, in its order. f_true = f exp(c), both.
     Entry('focal_log', 1, '', 0.3, 0.45),
-    # fy / fx.
-    Entry('aspect', 1, '', 0.002, 0.01),
+    # fy / fx, true = configured exp(c): of images that were resized along one axis alone.
+    Entry('aspect', 1, '', 0.2, 0.35),
     # Coefficients k1, k2, k3 in the whole vector. Where `Selection.of_camera` is applied, values
     # of `radial.independent_shapes`, of which the first one is k1 alone.
     Entry('distortion', 3, '', WRONG_SIGMA, 0.6),
     # [px] in the whole vector, in widths of the image where `Selection.of_camera` is applied.
     Entry('principal_point', 2, 'width', 0.015, 0.1),
 )
+
+# 1 sigma of fy / fx of a camera whose focal length is known. A smaller one would hold pixels that
+# are not quite square, a larger one would widen poses for what calibrations exclude.
+# [chosen: pixels are square; any value in 0.001..0.005 would do]
+ASPECT_SIGMA = 0.002
 
 
 def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
@@ -157,6 +162,7 @@ LIVE = Selection.of(
     'gyro_scale',
     'gyro_skew',
     'focal_log',
+    'aspect',
     'distortion',
     'principal_point',
 )
