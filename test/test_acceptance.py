@@ -17,6 +17,9 @@ from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
+# The first one of them compiles the kernels of a calibration where no cache has them.
+pytestmark = pytest.mark.timeout(400)
+
 
 def recorded(seed: int, **values: object) -> Recorded:
     rng = np.random.default_rng(seed)

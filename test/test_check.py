@@ -643,9 +643,9 @@ def test_distortion_that_a_camera_info_denies_is_found(converted):
     path = converted('realsense_rgb_rs_b')
     findings, report = checked(path, read_parameters(f'{path}.yaml'))
     assert {f.code for f in report.findings if f.state is F} == {'distortion'}
-    lens = findings['distortion'].estimated
+    lens = findings['distortion'].finding.estimated
     np.testing.assert_allclose(lens, (0.163, -0.520, 0.474), atol=0.12)
-    assert text_of(findings['distortion']).fix.startswith('set distortion_coefficients')
+    assert findings['distortion'].fix.startswith('set distortion_coefficients')
 
 
 @pytest.mark.recordings
