@@ -169,8 +169,8 @@ def _residual_tests(observation: Observation, write: _Writer) -> str:
         for one in known
     )
     return (
-        f'<p>{_TESTS}</p><table><tr><th>map</th><th>p</th><th>least probable cell</th></tr>'
-        f'{rows}</table>'
+        f'<p>{_TESTS}</p><div class="wide"><table>'
+        f'<tr><th>map</th><th>p</th><th>least probable cell</th></tr>{rows}</table></div>'
     )
 
 
