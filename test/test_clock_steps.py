@@ -92,9 +92,9 @@ def calibration_of(offsets, seed=3, noise=0.002, entry='time_offset'):
     )
 
 
-def change_by(pairs):
+def change_by(pairs, stamp_sigma=0.0):
     ranked = assessment.hypotheses(pairs, CONFIGURED)
-    return change_of(ranked, STAMPS_NS, CONFIGURED)
+    return change_of(ranked, STAMPS_NS, CONFIGURED, stamp_sigma=stamp_sigma)
 
 
 @pytest.mark.parametrize(('step', 'first'), [(0.0031, 50), (-0.0044, 21)])
@@ -106,6 +106,12 @@ def test_a_small_step_is_located(step, first):
     assert found.sigma < 7e-4
     before_ns, after_ns = found.between_ns
     assert before_ns - 4e8 < STAMPS_NS[first] < after_ns + 4e8
+
+
+def test_a_step_within_the_jitter_of_stamps_is_none():
+    pairs = calibration_of(np.where(np.arange(PAIRS) < 40, 0.0, 0.0052))
+    assert change_by(pairs, stamp_sigma=0.0011).kind is Kind.STEP
+    assert change_by(pairs, stamp_sigma=0.0025) is None
 
 
 @pytest.mark.parametrize('rate', [310e-6, -450e-6])

@@ -96,6 +96,7 @@ class ConsistencyMonitor:
         self._inconsistent: list[Inconsistency] = []
         self._likely = np.zeros(LIVE.size)  # about which pairs are linearised
         self._undetermined: Array | None = None  # by the pairs before
+        self.stamp_sigma = 0.0  # [s] scatter of the stamps of the last frames
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self.clock_steps = ClockSteps()
@@ -248,7 +249,7 @@ class ConsistencyMonitor:
         self.change = (
             None
             if assessment.unexplained(estimated)
-            else change_of(ranked, stamps_ns, configured, self.change)
+            else change_of(ranked, stamps_ns, configured, self.change, self.stamp_sigma)
         )
         if self.change is not None and self.change.is_drift_of('focal_log'):
             # It is not followed: what matters is the focal length of now.

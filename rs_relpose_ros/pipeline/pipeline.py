@@ -346,12 +346,13 @@ class Pipeline(Processor[PairResult]):
         since = history.since
         assert since is not None
         matches = self._tracker.refined_matches()
+        monitor.stamp_sigma = math.hypot(stamp_sigma(self._stamps_ns), frame.imu_doubt.varying)
         problem = history.problem(
             frame.stamp_ns,
             matches,
             sensor,
             parameters,
-            stamp_sigma=math.hypot(stamp_sigma(self._stamps_ns), frame.imu_doubt.varying),
+            stamp_sigma=monitor.stamp_sigma,
         )
         pose = self._estimated(problem, frame.stamp_ns)
         # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
