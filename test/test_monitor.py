@@ -1104,6 +1104,25 @@ def test_traces_of_a_gross_error_are_left_out_of_a_run():
     assert [f.code for f in worst_of(run, small).faults] == ['axes', 'gyro_bias']
 
 
+def test_what_few_pairs_showed_and_more_do_not_was_a_trace():
+    def by(pairs, code, state):
+        return replace(finding(code, state), evidence=Evidence(shift=2.0, pairs=pairs))
+
+    early = Assessment((by(17, 'principal_point', SUSPECT), finding('gyro_scale', UNKNOWN)))
+    hidden = replace(finding('principal_point', UNKNOWN), why=Why.OTHER_INCONSISTENT)
+    for pairs, left in ((33, ['principal_point', 'gyro_scale']), (34, ['gyro_scale'])):
+        late = Assessment((hidden, by(pairs, 'gyro_scale', SUSPECT)))
+        assert [one.code.value for one in worst_of(early, late).faults] == left
+    # Without another cause nothing was a trace, nor is what was wrong.
+    fine = Assessment((replace(finding('principal_point', OK), why=Why.CONSISTENT),))
+    assert worst_of(early, fine).faults
+    wrong = Assessment((by(17, 'principal_point', WRONG),))
+    assert (
+        worst_of(wrong, Assessment((hidden, by(90, 'gyro_scale', SUSPECT)))).faults[0].state
+        is WRONG
+    )
+
+
 # -- tracked parameters --------------------------------------------------------------------------
 
 

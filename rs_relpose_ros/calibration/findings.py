@@ -268,6 +268,7 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
 
     If `now` has a gross error, masks a part of the image, or has a change of the offset or pairs
     without an explanation, and `before` had not, earlier findings were its traces and are dropped.
+    So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`).
     """
     traces = (
         (now.is_gross and not before.is_gross)
@@ -278,9 +279,27 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
     # A quantity that was observable once is not unknown any more.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:
-        if order.index(found.setdefault(one.code, one).state) <= order.index(one.state):
+        known = found.setdefault(one.code, one)
+        if order.index(known.state) <= order.index(one.state) or _is_trace(known, one, now):
             found[one.code] = one
     return Assessment(tuple(found.values()))
+
+
+# Pairs of a later finding over those of an earlier one from which it overrules it. Less would drop
+# what half of the evidence shows, more would keep what the first seconds confuse. [chosen: 1.5 to
+# 4 would do]
+_OVERRULES = 2
+
+
+def _is_trace(earlier: Finding, later: Finding, now: Assessment) -> bool:
+    """Whether a suspect parameter was a trace of another one, which more pairs show by now."""
+    few = earlier.evidence.pairs
+    if few is None or earlier.state is not FindingState.SUSPECT or earlier.why is not Why.OFF:
+        return False
+    by_more = any(
+        one.why is Why.OFF and (one.evidence.pairs or 0) >= _OVERRULES * few for one in now.faults
+    )
+    return by_more and later.why in (Why.CONSISTENT, Why.OTHER_INCONSISTENT)
 
 
 def rounded(values: ArrayLike, digits: int = 5) -> list[float]:
