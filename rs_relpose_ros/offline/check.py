@@ -860,7 +860,9 @@ def quantity_findings(
     """
     for finding in health.findings:
         message, fix = text_of(finding)
-        state = _state(finding)
+        # A value without an effect on poses may be a trace of one that has an effect.
+        is_trace = finding.state is OK and bool(health.faults)
+        state = OK if is_trace else _state(finding)
         is_offset = finding.code is Code.TIME_OFFSET and state is SUSPECT
         if is_offset and _is_within(finding, offset_doubt):
             state = finding.state
