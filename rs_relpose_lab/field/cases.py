@@ -71,10 +71,14 @@ def _chain(*changes: Change) -> Change:
     return apply
 
 
+# A parameter file that states the sigma of one value states those of all; 0: not known.
+_NOT_KNOWN = {'time_offset_sigma': 0.0, 'readout_time_sigma': 0.0, 'axes_sigma': 0.0}
+
+
 def _misstated(name: str, change: Any, sigma: str, value: float) -> Change:
     """A parameter that is off by its own stated sigma."""
     return lambda recording: recording.configured(
-        **{name: change(recording.parameters[name]), sigma: value}
+        **(_NOT_KNOWN | {name: change(recording.parameters[name]), sigma: value})
     )
 
 
