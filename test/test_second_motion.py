@@ -97,6 +97,17 @@ def test_pairs_among_many_that_contradict_the_gyro_are_not_trusted(squares, with
     assert not contradictions.too_many
 
 
+def test_rotations_that_differ_as_the_configuration_allows_are_no_contradiction():
+    contradictions = Contradictions()
+    pose = pose_of(np.ones(30, dtype=bool), 41.0)
+    for _ in range(8):
+        contradictions.add(pose, is_allowed=True)
+    assert not contradictions.too_many
+    for _ in range(8):
+        contradictions.add(pose)
+    assert contradictions.too_many
+
+
 def test_a_scene_behind_an_object_that_agrees_with_the_gyro_keeps_its_poses():
     motions = SecondMotions()
     for pair in flight(NONE, 9):

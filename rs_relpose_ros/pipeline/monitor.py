@@ -59,6 +59,9 @@ _MOST_REJECTED = 2
 # The same of pairs whose rotation differs from the gyro's by `_DIFFERENT`. [measured: none on
 # correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
 _MOST_DIFFERENT = 5
+# Sigmas from which a deviation is certain, and up to which the configuration allows it.
+# [derived: as the states of the findings have it]
+_ALLOWED = 3.0
 # Chi-square (3 degrees of freedom) of that difference. [derived: once in 1000 by definition]
 _DIFFERENT = 16.0
 # Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
@@ -117,6 +120,15 @@ class ConsistencyMonitor:
         # Velocities of a wrong configuration are no evidence.
         if not self._wrong_configuration:
             self.acceleration.add(stamp_ns, evidence)
+
+    def deviates_as_allowed(self, configured: Configured) -> bool:
+        """Whether a parameter certainly deviates, but within its configured sigma.
+
+        Images and gyro then differ in every pair, and the covariance of poses contains it.
+        """
+        off = np.abs(self.calibration.c - configured.active)
+        is_certain = off > _ALLOWED * self.calibration.sigma
+        return bool((is_certain & (off < _ALLOWED * configured.sigmas)).any())
 
     def add_pair(
         self,
@@ -435,10 +447,14 @@ class Contradictions:
     def __init__(self) -> None:
         self._kinds: deque[tuple[bool, bool]] = deque(maxlen=_RECENT)
 
-    def add(self, pose: RelativePose) -> None:
-        """Add a pair with the pose of its estimate, which may be rejected."""
+    def add(self, pose: RelativePose, *, is_allowed: bool = False) -> None:
+        """Add a pair with the pose of its estimate, which may be rejected.
+
+        `is_allowed`: whether a deviation within its configured sigma makes rotations differ.
+        """
         is_rejected = pose.diagnostics.rejected is not None
-        self._kinds.append((is_rejected, is_rejected or pose.diagnostics.gyro_square > _DIFFERENT))
+        differs = not is_allowed and pose.diagnostics.gyro_square > _DIFFERENT
+        self._kinds.append((is_rejected, is_rejected or differs))
 
     def clear(self) -> None:
         """Forget the pairs."""

@@ -371,7 +371,8 @@ class Pipeline(Processor[PairResult]):
         stamps_ns = history.stamp_ns, frame.stamp_ns
         doubtful = monitor.clock_steps.add(stamps_ns, since, data, pose)
         if data is not None:
-            monitor.contradictions.add(pose)
+            is_allowed = monitor.deviates_as_allowed(configured)
+            monitor.contradictions.add(pose, is_allowed=is_allowed)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
