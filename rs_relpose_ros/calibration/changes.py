@@ -52,7 +52,7 @@ _AFTER = 4
 # Least step in sigmas of a single stamp. Less would take the mean of some stamps that jitter, as
 # times of arrival do, for a step. [derived: 3 sigmas; measured: with delays of 6 ms in the mean a
 # step of 6.7 +- 1.3 ms was named]
-_BEYOND_JITTER = 3.0
+BEYOND_JITTER = 3.0
 # Shortest time [ns] that shows a drift. [chosen: a step or a change of temperature takes less]
 _SHORTEST_NS = to_nanoseconds(6.0)
 # The deviation that may step. [derived: a clock that is set]
@@ -131,7 +131,7 @@ def change_of(
             return _change(entry, Kind.DRIFT, drift, ends, lead, count)
     step, best = _best(constant(estimated, configured), after, _STEP_SIGMA, _OFFSET)
     lead = step.gain - max(others[_OFFSET], *totals.values())
-    is_jitter = abs(step.value) < _BEYOND_JITTER * stamp_sigma
+    is_jitter = abs(step.value) < BEYOND_JITTER * stamp_sigma
     if not is_jitter and min(step.certainty - _CERTAIN, lead - _LEAD) > 0.0:
         last = _BEFORE + best
         between = int(stamps_ns[last - 1]), int(stamps_ns[last])

@@ -220,8 +220,11 @@ class ClockSteps:
         self._curves.clear()
         self._is_unsettled = False
 
-    def found(self) -> ClockStep | None:
-        """The step of the time offset that explains the pairs of the doubt, if there is one."""
+    def found(self, least: float = 0.0) -> ClockStep | None:
+        """The step of the time offset that explains the pairs of the doubt, if there is one.
+
+        A smaller one than `least` [s] is none: stamps jitter by as much.
+        """
         # The first of them may contain the step.
         pairs = self._doubtful[1:]
         whole = self.joined
@@ -243,7 +246,7 @@ class ClockSteps:
         if not is_certain:
             return None
         seconds, sigma = self._refined(pairs, stream, float(offsets[best]))
-        if not self._fits(pairs, stream, seconds):
+        if abs(seconds) < least or not self._fits(pairs, stream, seconds):
             return None
         first = self._doubtful[0]
         self._since_last = 0

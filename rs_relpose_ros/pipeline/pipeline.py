@@ -13,6 +13,7 @@ import numpy as np
 
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.assessment import configured_sigmas
+from rs_relpose_ros.calibration.changes import BEYOND_JITTER
 from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import PairData
 from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
@@ -413,7 +414,7 @@ class Pipeline(Processor[PairResult]):
         if (wrong := steps.refuted()) is not None:
             self.applied = self.applied.after_step(-wrong.seconds, -(wrong.sigma**2))
             monitor.restart()
-        elif (step := steps.found()) is not None:
+        elif (step := steps.found(BEYOND_JITTER * monitor.stamp_sigma)) is not None:
             self.applied = self.applied.after_step(step.seconds, step.sigma**2)
             sensor = _with_step(configured.sensor, step.seconds)
             monitor.follow_step(step, validate.replaced(configured, sensor=sensor))
