@@ -11,6 +11,7 @@ from rs_relpose_lab.field.cases import BASES, BY_NAME, CASES
 from rs_relpose_lab.field.recording import base_recording, write_recording
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_parameters
 
 SMALL = SimulationConfig(
     seed=77,
@@ -141,3 +142,11 @@ def test_the_report_counts_verdicts(tmp_path, base, answered):
     text = run.report(tmp_path, [judged, replace(judged, verdict='failure', reason='x')])
     assert '2 cases: 1 good, 0 poor, 1 failure' in text
     assert (tmp_path / 'field.csv').exists()
+
+
+@pytest.mark.parametrize('name', ['O1', 'O2-axes', 'O2-readout'])
+def test_parameters_that_are_off_by_their_sigma_are_a_parameter_file(name, base, tmp_path):
+    recording = BY_NAME[name].change(base)
+    parameters = read_parameters(write_recording(recording, tmp_path / 'bag'))
+    sigmas = ('time_offset_sigma', 'readout_time_sigma', 'axes_sigma')
+    assert sum(getattr(parameters.sensor, sigma) > 0.0 for sigma in sigmas) == 1

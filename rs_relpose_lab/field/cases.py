@@ -421,7 +421,7 @@ CASES: tuple[Case, ...] = (
         'axes off by their own stated sigma of 0.6 deg',
         _misstated(
             'quat_cam_imu_xyzw',
-            lambda q: tuple(np.asarray(q) + 0.0052 * np.array([q[3], q[2], -q[1], -q[0]])),
+            lambda q: (np.array(q) + 0.0052 * np.array([q[3], q[2], -q[1], -q[0]])).tolist(),
             'axes_sigma',
             0.0105,
         ),
