@@ -1566,7 +1566,7 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
             0.03,
             -0.004,
             8e-4,
-            1.0,
+            1.2,
         ),
     ],
 )
