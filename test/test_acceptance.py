@@ -3,11 +3,12 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+from drawn_recordings import camera_of, recorded
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
+from rs_relpose_lab.experiments.calibration_tracks import Recorded
 from rs_relpose_ros.calibrate import acceptance, procedure
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
@@ -19,25 +20,6 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 # The first one of them compiles the kernels of a calibration where no cache has them.
 pytestmark = pytest.mark.timeout(400)
-
-
-def recorded(seed: int, **values: object) -> Recorded:
-    rng = np.random.default_rng(seed)
-    truth = drawn(rng, **({'readout_time': 0.02, 'frames': 240} | values))
-    return record(replace(truth, fps=30.0), rng)
-
-
-def camera_of(one: Recorded) -> RollingShutterCamera:
-    truth = one.truth
-    return RollingShutterCamera(
-        width=truth.width,
-        height=truth.height,
-        fx=truth.focal,
-        fy=truth.focal,
-        cx=truth.width / 2,
-        cy=truth.height / 2,
-        readout_time=0.0,
-    )
 
 
 def calibrated(one: Recorded, camera: RollingShutterCamera) -> CalibrationResult:
@@ -80,7 +62,7 @@ def test_one_view_that_turns_and_approaches_is_one_view():
 
 
 def test_a_squeezed_image_does_not_bend_what_a_node_needs():
-    one = recorded(42)
+    one = recorded(42, frames=240)
     camera = camera_of(one)
     points = one.tracks.points * [0.8, 1.0]
     squeezed = replace(one, tracks=replace(one.tracks, points=points))
@@ -98,7 +80,7 @@ def test_a_squeezed_image_does_not_bend_what_a_node_needs():
 
 
 def test_a_vibrating_gyro_determines_neither_readout_nor_offset():
-    one = recorded(43)
+    one = recorded(43, frames=240)
     camera = camera_of(one)
     shaken = one.gyro.rates + np.random.default_rng(1).normal(0.0, 0.25, one.gyro.rates.shape)
     result = calibrated(replace(one, gyro=replace(one.gyro, rates=shaken)), camera)

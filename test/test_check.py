@@ -493,6 +493,19 @@ def test_a_certain_deviation_counts_though_no_pose_suffers(state, estimated, exp
     assert bool(further) is (raised or expected == 'failure')
 
 
+def test_a_deviation_that_does_no_harm_is_none_beside_one_that_does():
+    harmless = Finding(
+        Code.READOUT_TIME, FindingState.OK, Why.CONSISTENT, (0.03,), (0.0368,), 1e-3, 's'
+    )
+    (alone,) = quantity_findings(Assessment((harmless,)), '')
+    assert alone.state is W
+    harm = Finding(
+        Code.FOCAL_LENGTH, F, Why.OFF, (450.0,), (462.0,), 1.0, 'px', evidence=Evidence(shift=9.0)
+    )
+    beside, named = quantity_findings(Assessment((harmless, harm)), '')
+    assert (beside.state, named.state) == (FindingState.OK, F)
+
+
 @pytest.mark.parametrize(
     'name, configured, estimated, state',
     [

@@ -3,36 +3,17 @@
 from dataclasses import replace
 import json
 
+from drawn_recordings import camera_of, recorded
 import numpy as np
 import pytest
 
-from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
+from rs_relpose_lab.experiments.calibration_tracks import Recorded
 from rs_relpose_ros.calibrate.procedure import calibrate, calibrate_together, CalibrationInput
 from rs_relpose_ros.calibrate.result import as_mapping, CalibrationResult, parameter_file, report
 from rs_relpose_ros.calibration.offset_course import OffsetCourse, OffsetStep
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.output_files import json_text
-
-
-def recorded(seed: int, seconds: float = 10.0) -> Recorded:
-    rng = np.random.default_rng(seed)
-    truth = drawn(rng, readout_time=0.02, frames=round(30 * seconds))
-    return record(replace(truth, fps=30.0), rng)
-
-
-def camera_of(one: Recorded) -> RollingShutterCamera:
-    truth = one.truth
-    return RollingShutterCamera(
-        width=truth.width,
-        height=truth.height,
-        fx=truth.focal,
-        fy=truth.focal,
-        cx=truth.width / 2,
-        cy=truth.height / 2,
-        readout_time=0.0,
-    )
 
 
 def shifted(one: Recorded, seconds: np.ndarray) -> Recorded:
@@ -50,12 +31,12 @@ def calibrated(one: Recorded, **config: object) -> CalibrationResult:
 
 
 def test_a_recording_with_one_offset_has_no_changes():
-    assert calibrated(recorded(31)).offset_changes is None
+    assert calibrated(recorded(31, frames=300)).offset_changes is None
 
 
 @pytest.mark.parametrize('step', [0.06, 0.31])
 def test_a_step_of_the_camera_is_located_and_both_sides_have_their_offset(step):
-    one = recorded(32)
+    one = recorded(32, frames=300)
     after = times_of(one) >= 4.0
     result = calibrated(shifted(one, step * after))
     offset = result.time_offset
@@ -75,7 +56,7 @@ def test_a_step_of_the_camera_is_located_and_both_sides_have_their_offset(step):
 
 
 def test_a_node_that_goes_on_needs_the_offset_after_the_step():
-    one = recorded(32)
+    one = recorded(32, frames=300)
     after = times_of(one) >= 4.0
     result = calibrated(shifted(one, 0.06 * after), offset_at_end=True)
     offset = result.time_offset
@@ -83,7 +64,7 @@ def test_a_node_that_goes_on_needs_the_offset_after_the_step():
 
 
 def test_a_step_of_the_imu_leaves_out_what_overlaps():
-    one = recorded(33)
+    one = recorded(33, frames=300)
     gyro = one.gyro
     seconds = (gyro.stamps_ns - one.tracks.stamps_ns[0]) * 1e-9
     stamps = gyro.stamps_ns - np.where(seconds >= 5.0, 100_000_000, 0)
@@ -99,7 +80,7 @@ def test_a_step_of_the_imu_leaves_out_what_overlaps():
 
 
 def test_a_drift_is_named_and_its_sigma_holds_all_over_the_recording():
-    one = recorded(34, seconds=14.0)
+    one = recorded(34, frames=420)
     result = calibrated(shifted(one, -4e-4 * times_of(one)))
     drift = result.offset_changes.drift
     assert abs(drift.value - 4e-4) < 4.0 * drift.sigma
@@ -113,7 +94,7 @@ def test_a_drift_is_named_and_its_sigma_holds_all_over_the_recording():
 
 
 def test_recordings_whose_clocks_change_are_not_joined():
-    one, other = recorded(32), recorded(32)
+    one, other = recorded(32, frames=300), recorded(32, frames=300)
     stepped = shifted(other, 0.06 * (times_of(other) >= 4.0))
     inputs = [CalibrationInput(r.tracks, r.gyro, camera_of(r), True, {}) for r in (one, stepped)]
     with pytest.raises(InputError, match='within recording 2'):

@@ -81,7 +81,7 @@ _QUARTER_TURN = 0.3
 _OBSERVABLE_IN = 0.9
 # Sigmas within which a parameter that was configured with a sigma is as configured.
 # [derived: the 99.7 % quantile of a normal deviate]
-_AS_CONFIGURED = 3.0
+AS_CONFIGURED = 3.0
 # Error that linearisation leaves, 1 sigma as a share of the last step. Smaller shares would make
 # the sigma of a suggested value too small. [measured: on recordings with times that are far off,
 # steps are 0.4 to 0.8 of the error, with other parameters 0.9; without it the first value of an
@@ -453,7 +453,7 @@ def assess(
         one.quantity.code: one
         for one in inconsistent
         if one.shift > max(_MATTERS, _TRACE * largest)
-        and (np.abs(one.deviation) > (_AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()
+        and (np.abs(one.deviation) > (AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()
     }
     others = {
         one.alternative.quantity.code: one.alternative

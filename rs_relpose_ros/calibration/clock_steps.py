@@ -60,7 +60,7 @@ _LEAST_SINE = 1e-8
 # Chi-square (3 degrees of freedom) of the rotation by images against the gyro from which a pair
 # contradicts the gyro. A smaller limit would doubt correct pairs, a larger one would publish more
 # pairs after a step. [measured: at most 1.3 on simulated walks; once in 1000 by definition]
-_CONTRADICTING = 16.0
+CONTRADICTS_GYRO = 16.0
 # Pairs by whose median the chi-square is scaled: covariances of a recording may be too small.
 # [measured: the median is 0.1 on simulated walks, 1 to 4 on recordings of a RealSense and a phone]
 _USUAL_PAIRS = 40
@@ -182,7 +182,7 @@ class ClockSteps:
         if pose.diagnostics.rejected is not None:
             return True
         usual = max(float(np.median(self._chi_squares)), 1.0)
-        return bool(pose.diagnostics.gyro_square > _CONTRADICTING * usual)
+        return bool(pose.diagnostics.gyro_square > CONTRADICTS_GYRO * usual)
 
     def add(
         self,

@@ -148,14 +148,19 @@ def _misfit_of(found: Fit, part: NDArray[np.bool_]) -> float:
     at, curve = found.evaluation, bent(found.weights)
     own = curve * at.reduced[part].sum(axis=0)
     rest = curve * at.reduced.sum(axis=0) + found.problem.prior[found.block] - own
-    sigmas = np.sqrt(np.diag(rest + own))
+    # The score and its covariance at the optimum of the rest, which these pairs have moved.
     own_score = at.score[part].sum(axis=0)
-    score = (own_score + own @ np.linalg.solve(rest, own_score)) / sigmas
-    covariance = (own + own @ np.linalg.solve(rest, own)) / np.outer(sigmas, sigmas)
-    variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    score = own_score + own @ np.linalg.solve(rest, own_score)
+    covariance = own + own @ np.linalg.solve(rest, own)
+    # Scaled: the parameters have different units.
+    scale = 1.0 / np.sqrt(np.diag(rest + own))
+    scaled = covariance * np.outer(scale, scale)
+    variances, directions = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    along = directions.T @ (scale * score)
     says = variances > _SAYS_NOTHING * variances[-1]
-    squares = (directions.T @ score)[says] ** 2 / variances[says]
-    return float(squares.mean()) / float(found.problem.weight[part].mean())
+    squares = along[says] ** 2 / variances[says]
+    weight = float(found.problem.weight[part].mean())
+    return float(squares.mean()) / weight
 
 
 def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior: Array) -> Array:

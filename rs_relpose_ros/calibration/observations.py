@@ -581,13 +581,14 @@ def rates_at(measured_rates: MeasuredRates, offsets: Array, start: Start) -> Rat
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
     lens = np.array([1.0 / start.focal_factor, 1.0 / start.focal_factor, 1.0])
     order = np.argsort(begins + ends, kind='stable')
-    begins, ends = begins[order], ends[order]
+    spans = np.column_stack([begins, ends])[order]
     gyro = np.full((len(offsets), len(rates), 3), np.nan)
     for number, offset in enumerate(offsets):
-        known = (begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1])
-        means = _mean_rates(turned, gyro_times, begins[known] + offset, ends[known] + offset)
+        begin, end = (spans + offset).T
+        known = (begin >= gyro_times[0]) & (end <= gyro_times[-1])
+        means = _mean_rates(turned, gyro_times, begin[known], end[known])
         gyro[number, known] = means @ start.R_cam_imu.T
-    return RatesAtOffsets(0.5 * (begins + ends), offsets, rates[order] * lens, gyro)
+    return RatesAtOffsets(spans.mean(axis=1), offsets, rates[order] * lens, gyro)
 
 
 # Step of the times at which sizes of rates are correlated [s]. A longer one would miss a peak.

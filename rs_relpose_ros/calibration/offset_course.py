@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.losses import SIGMA_PER_MEDIAN
 from rs_relpose_ros.geometry import Array
 
 # Time [s] beside a step whose images are not used, on either side, beyond the step itself. Less
@@ -168,11 +169,11 @@ def proposed(rates: RatesAtOffsets) -> OffsetCourse:
 def _costs(left: Array, path: NDArray[np.int64]) -> Array:
     """Minus the log-likelihoods (M, P) of the differences (M, P, 3), by their noise on a path."""
     on_path = left[path, np.arange(len(path))]
-    known = np.isfinite(on_path).all(axis=1)
-    mean = np.median(on_path[known], axis=0)
-    off = on_path[known] - mean
-    noise = max(1.4826 * float(np.median(np.abs(off))), _LEAST_NOISE)
-    squares = (((left - mean) / noise) ** 2).sum(axis=2) / _ROBUST**2
+    known = on_path[np.isfinite(on_path).all(axis=1)]
+    mean = np.median(known, axis=0)
+    noise = SIGMA_PER_MEDIAN * float(np.median(np.abs(known - mean)))
+    scaled = (left - mean) / max(noise, _LEAST_NOISE)
+    squares = (scaled**2).sum(axis=2) / _ROBUST**2
     # The loss of Geman and McClure, q / (1 + q), which is 1 where nothing is known.
     losses = 1.0 - 1.0 / (1.0 + np.where(np.isfinite(squares), squares, np.inf))
     return np.asarray(0.5 * _ROBUST**2 / _ALIKE * losses)
@@ -220,17 +221,30 @@ def _best_drift(costs: Array, middles: Array) -> tuple[float, float, NDArray[np.
 
 def _steps(costs: Array, path: NDArray[np.int64], rates: RatesAtOffsets) -> tuple[OffsetStep, ...]:
     """The steps of a path (P,), each with the images between which it may be."""
-    borders = [0, *(np.flatnonzero(np.diff(path)) + 1).tolist(), len(path)]
+    changes = np.flatnonzero(np.diff(path)) + 1
+    borders = [0, *changes.tolist(), len(path)]
+    middles = rates.middles
     found = []
     for begin, border, end in zip(borders, borders[1:], borders[2:], strict=False):
-        before, after = int(path[begin]), int(path[border])
+        before, after = path[begin], path[border]
         seconds = float(rates.offsets[after] - rates.offsets[before])
         if abs(seconds) < _SMALLEST:
             continue
-        # Cost of the border at each pair of both sections, but for a constant.
-        difference = costs[before, begin:end] - costs[after, begin:end]
-        at_border = np.cumsum(difference) - difference
-        likely = begin + np.flatnonzero(at_border <= at_border.min() + _NOT_KNOWN)
-        first, last = max(int(likely[0]) - 1, 0), min(int(likely[-1]), len(path) - 1)
-        found.append(OffsetStep(float(rates.middles[first]), float(rates.middles[last]), seconds))
+        section = costs[:, begin:end]
+        first, last = _place(section[before] - section[after])
+        # One image more at the begin: the rates are those between images.
+        first = max(begin + first - 1, 0)
+        last = min(begin + last, len(path) - 1)
+        found.append(OffsetStep(float(middles[first]), float(middles[last]), seconds))
     return tuple(found)
+
+
+def _place(differences: Array) -> tuple[int, int]:
+    """First and last number of the pairs (N,) before which the step may be.
+
+    `differences` are the costs of the offset before the step less those of the offset after it.
+    """
+    # Cost of a border before each pair, but for a constant.
+    at_border = np.cumsum(differences) - differences
+    likely = np.flatnonzero(at_border <= at_border.min() + _NOT_KNOWN)
+    return int(likely[0]), int(likely[-1])

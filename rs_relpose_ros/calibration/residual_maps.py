@@ -25,6 +25,7 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
+from rs_relpose_ros.core.losses import SIGMA_PER_MEDIAN
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.matches import Matches
@@ -72,8 +73,6 @@ _BOUND = 4.0
 # Bound of the rotation of images against the gyro, in robust sigmas of all pairs, likewise.
 # [chosen: 2.5 to 4 would do]
 _BOUND_OF_ROTATION = 3.0
-# Median of the size of a normal deviate. [derived]
-_MEDIAN_SIZE = 0.6745
 # Least length of a direction that is divided by. [derived: no division by zero]
 _TINY = 1e-12
 # Components of a residual, in the order of `PairSums.cells`. [derived: text for people]
@@ -389,7 +388,7 @@ def _weighted_rotations(pairs: Sequence[PairSums]) -> Array:
     apart = np.array([pair.against_gyro for pair in pairs])
     weights = np.minimum([pair.change for pair in pairs], _LARGEST_CHANGE)
     sizes = np.abs(apart[np.isfinite(apart)])
-    scale = float(np.median(sizes)) / _MEDIAN_SIZE if len(sizes) else 0.0
+    scale = SIGMA_PER_MEDIAN * float(np.median(sizes)) if len(sizes) else 0.0
     bound = _BOUND_OF_ROTATION * scale
     return np.asarray(weights * np.clip(apart, -bound, bound))
 

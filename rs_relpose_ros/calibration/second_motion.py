@@ -14,6 +14,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.clock_steps import CONTRADICTS_GYRO
 from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, FindingState, Why
 from rs_relpose_ros.calibration.posterior import PairData, problem_of
 from rs_relpose_ros.estimator.result import RelativePose
@@ -42,9 +43,6 @@ _STEPS = (0.7548776662466927, 0.5698402909980532)
 # Least distance [px] of two matches that make a similarity: noise turns a shorter one.
 # [chosen: 10 to 40 would do]
 _APART = 20.0
-# Chi-square (3 degrees of freedom) of the rotation by images against the gyro from which a pair
-# contradicts the gyro. [derived: once in 1000 by definition]
-_CONTRADICTING = 16.0
 # Share of the matches that scene and object explain together at least. Less would take for an
 # object what a wrong clock makes of the scene, more would miss objects among poor matches.
 # [measured: in half of the pairs with an object, in 3 % of those with a clock that is off by half
@@ -77,7 +75,7 @@ class SecondMotions:
 
     def add(self, data: PairData, pose: RelativePose) -> bool:
         """Add a pair with its best pose; whether the pose may be that of an object."""
-        contradicts = not pose.diagnostics.gyro_square <= _CONTRADICTING  # NaN: another rotation
+        contradicts = not pose.diagnostics.gyro_square <= CONTRADICTS_GYRO  # NaN: another rotation
         share = second_share(data, pose.inliers)
         self._shares.append(share)
         self._contradict.append(contradicts)
@@ -171,8 +169,10 @@ def _in_planes(rays1: Array, rays2: Array, within: float) -> Flags:
     axes = np.cross(normals[first], normals[second])
     for _ in range(_ROUNDS):
         axes /= np.maximum(np.linalg.norm(axes, axis=1), np.finfo(float).tiny)[:, None]
-        squares = [(rays**2).sum(axis=1) - (axes @ rays.T) ** 2 for rays in (rays1, rays2)]
-        fit = np.abs(axes @ normals.T) < within * np.sqrt(squares[0] + squares[1])
+        # Of each ray, the part across an axis: how far a normal moves with a change of the ray.
+        across1 = (rays1**2).sum(axis=1) - (axes @ rays1.T) ** 2
+        across2 = (rays2**2).sum(axis=1) - (axes @ rays2.T) ** 2
+        fit = np.abs(axes @ normals.T) < within * np.sqrt(across1 + across2)
         best = np.argsort(-fit.sum(axis=1))[:_REFINED]
         moments = np.einsum('an,ni,nj->aij', fit[best].astype(float), normals, normals)
         axes = np.linalg.eigh(moments)[1][:, :, 0]

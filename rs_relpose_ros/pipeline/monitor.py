@@ -14,7 +14,7 @@ from scipy.linalg import solve_triangular
 from rs_relpose_ros.calibration import assessment, findings, findings_text, posterior
 from rs_relpose_ros.calibration.assessment import Effect, Inconsistency
 from rs_relpose_ros.calibration.changes import Change, change_of, drift_doubts, Kind
-from rs_relpose_ros.calibration.clock_steps import ClockStep, ClockSteps
+from rs_relpose_ros.calibration.clock_steps import ClockStep, ClockSteps, CONTRADICTS_GYRO
 from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
@@ -56,14 +56,9 @@ _RECENT = 8
 # would follow single poor pairs, more would publish poses of a camera that stabilises its images.
 # [measured: 2 of 41 pairs of a recording in poor light, none of other correct recordings]
 _MOST_REJECTED = 2
-# The same of pairs whose rotation differs from the gyro's by `_DIFFERENT`. [measured: none on
-# correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
+# The same of pairs whose rotation differs from the gyro's by `CONTRADICTS_GYRO`. [measured: none
+# on correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
 _MOST_DIFFERENT = 5
-# Sigmas from which a deviation is certain, and up to which the configuration allows it.
-# [derived: as the states of the findings have it]
-_ALLOWED = 3.0
-# Chi-square (3 degrees of freedom) of that difference. [derived: once in 1000 by definition]
-_DIFFERENT = 16.0
 # Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
 # a moving object would widen the pairs of many seconds.
 # [chosen: far above the 99.9 % quantile of two degrees of freedom, 6.9]
@@ -126,9 +121,8 @@ class ConsistencyMonitor:
 
         Images and gyro then differ in every pair, and the covariance of poses contains it.
         """
-        off = np.abs(self.calibration.c - configured.active)
-        is_certain = off > _ALLOWED * self.calibration.sigma
-        return bool((is_certain & (off < _ALLOWED * configured.sigmas)).any())
+        off = np.abs(self.calibration.c - configured.active) / assessment.AS_CONFIGURED
+        return bool(((off > self.calibration.sigma) & (off < configured.sigmas)).any())
 
     def add_pair(
         self,
@@ -453,7 +447,7 @@ class Contradictions:
         `is_allowed`: whether a deviation within its configured sigma makes rotations differ.
         """
         is_rejected = pose.diagnostics.rejected is not None
-        differs = not is_allowed and pose.diagnostics.gyro_square > _DIFFERENT
+        differs = not is_allowed and pose.diagnostics.gyro_square > CONTRADICTS_GYRO
         self._kinds.append((is_rejected, is_rejected or differs))
 
     def clear(self) -> None:
