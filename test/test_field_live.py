@@ -9,7 +9,10 @@ from fault_stream import BAG_TOPICS
 import pytest
 
 from rs_relpose_lab.field import defects
+from rs_relpose_lab.field.cases import BY_NAME
+from rs_relpose_lab.field.live import play
 from rs_relpose_lab.field.recording import base_recording, FieldRecording, write_recording
+from rs_relpose_lab.field.verdict import judge
 from rs_relpose_lab.live.graph import Graph
 from rs_relpose_lab.live.processes import node_process, player_process
 from rs_relpose_lab.simulation import SimulationConfig
@@ -59,6 +62,19 @@ def played(ros_domain_id: int, tmp_path: Path) -> Callable[[FieldRecording], Sim
             )
 
     return play
+
+
+def test_what_nodes_publish_is_compared_with_the_truth(ros_domain_id, tmp_path, walk):
+    """The evidence of a live run holds poses, states and causes of an intact recording."""
+    pytest.importorskip('gtsam', reason='needs the extra odometry')
+    parameters = write_recording(walk, tmp_path / 'bag')
+    evidence = play(walk, tmp_path / 'bag', parameters, tmp_path)
+    verdict = judge(BY_NAME['right'], evidence, evidence.pairs, 1.0)
+    assert (verdict.verdict, verdict.reason) == ('good', '')
+    assert verdict.poses >= 8
+    assert verdict.worst < 5.0
+    assert verdict.states >= 10
+    assert {'axes', 'time_offset'} <= {one.code for one in evidence.causes}
 
 
 def test_two_imus_on_a_topic_are_named_and_give_no_pose(played, walk):

@@ -497,17 +497,31 @@ def _run_carried_over(args: argparse.Namespace) -> int:
     '...), rebuilt from simulated recordings: check, calibrate, replay and odometry on each, and '
     'the verdict from the truth',
     Argument(
-        '--only', {'nargs': '+', 'default': ['all'], 'metavar': 'ID', 'help': 'some of them'}
+        '--only',
+        {
+            'nargs': '+',
+            'metavar': 'ID',
+            'help': 'some of them, with all their variants: G8 is G8-left and G8-bottom '
+            '(default: all; with --live C1, C12, G8, O1 and O3)',
+        },
+    ),
+    _flag(
+        '--live',
+        'in place of the commands play each to a running relpose_node and odometry_node, and '
+        'compare what they publish. Needs ROS',
     ),
     _JOBS,
 )
 def _run_field(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.field.cases import BY_NAME
+    from rs_relpose_lab.field.cases import BY_NAME, LIVE, with_variants
     from rs_relpose_lab.field.run import prepare_bases, report, run_case, Task
 
-    chosen = matching_cells(args.only, BY_NAME)
+    if args.live:
+        _need_ros()
+    names = args.only or (LIVE if args.live else ['all'])
+    chosen = matching_cells(with_variants(names), BY_NAME)
     args.output.mkdir(parents=True, exist_ok=True)
-    tasks = [Task(name, args.output) for name in chosen]
+    tasks = [Task(name, args.output, args.live) for name in chosen]
     if args.jobs > 1:
         prepare_bases(tasks)
     return _report_of(tasks, run_case, report, args, 'case')

@@ -6,7 +6,7 @@ and what a right answer may be. The verdict on an answer is computed from the tr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -56,19 +56,6 @@ class Case:
     solvable: bool = False
     withheld_is_right: bool = True
     commands: tuple[str, ...] = ('check', 'calibrate', 'replay', 'odometry')
-
-
-def _info(**fields: Any) -> Change:
-    return lambda recording: replace(recording, info_fields=fields)
-
-
-def _chain(*changes: Change) -> Change:
-    def apply(recording: FieldRecording) -> FieldRecording:
-        for change in changes:
-            recording = change(recording)
-        return recording
-
-    return apply
 
 
 # A parameter file that states the sigma of one value states those of all; 0: not known.
@@ -177,6 +164,28 @@ CASES: tuple[Case, ...] = (
         solvable=True,
     ),
     Case(
+        'C9',
+        'the device counts microseconds in 32 bits, which overflow after 10 s',
+        partial(_D.wrapped_clock, seconds=2**32 * 1e-6, after=10.0),
+        r'32[- ]bit|wrap|overflow|set back',
+        ('offset_step', 'time_offset'),
+        solvable=True,
+    ),
+    Case(
+        'C9-back',
+        'both clocks are set back by half a second after 12 s',
+        partial(_D.wrapped_clock, seconds=0.517, after=12.0),
+        r'set back|back(wards)?\b|earlier',
+        ('offset_step', 'time_offset'),
+    ),
+    Case(
+        'C9-nanoseconds',
+        'nanosec of the images exceeds a second',
+        _D.overflowing_nanoseconds,
+        r'nanosec',
+        ('time_offset',),
+    ),
+    Case(
         'C10',
         '10 samples of the IMU share the last stamp',
         partial(_D.bursts, size=10, stamped='last'),
@@ -267,6 +276,22 @@ CASES: tuple[Case, ...] = (
         partial(_D.accel_factor, factor=1.0 / 9.80665),
         r'\bg\b|unit|m/s',
         ('accel_axes', 'accel_scale', 'accel_unit', 'force_fault'),
+    ),
+    Case(
+        'I4',
+        'the driver removes gravity',
+        _D.gravity_removed,
+        r'gravity',
+        ('accel_axes', 'accel_scale'),
+        solvable=True,
+    ),
+    Case(
+        'I4-sign',
+        'specific force of the opposite sign, as of iOS',
+        partial(_D.accel_factor, factor=-1.0),
+        r'sign|opposite|gravity',
+        ('accel_axes', 'accel_scale'),
+        solvable=True,
     ),
     Case('I5', 'two IMUs on one topic', _D.two_imus, r'imu_link.*base_imu_link|two IMU'),
     Case(
@@ -430,6 +455,16 @@ CASES: tuple[Case, ...] = (
         solvable=True,
     ),
     Case(
+        'O2-focal',
+        'the focal length is off by its own stated sigma of 1 %',
+        lambda one: _D.focal_scaled(one, 1.01).configured(
+            **(_NOT_KNOWN | {'focal_length_sigma': 0.01})
+        ),
+        r'',
+        ('focal_length',),
+        solvable=True,
+    ),
+    Case(
         'O2-readout',
         'the readout time is off by its own stated sigma of 2 ms',
         _misstated('readout_time', lambda value: value + 0.002, 'readout_time_sigma', 0.002),
@@ -464,8 +499,19 @@ CASES: tuple[Case, ...] = (
         'the device is put down hard: the accelerometer clips at 8 g',
         partial(_D.knock, at=15.0, clip=78.0),
         r'',
-        ('accel_clipped', 'force_fault'),
+        ('knock', 'accel_noise'),
         base='stop',
     ),
 )
 BY_NAME = {case.name: case for case in CASES}
+# Situations that are played to running nodes by default.
+LIVE = ('C1', 'C12', 'G8-left', 'O1', 'O3')
+
+
+def with_variants(names: Iterable[str]) -> list[str]:
+    """Names in which a kind of situations, as G8, is replaced by its variants, as G8-left."""
+    chosen: list[str] = []
+    for name in names:
+        variants = [one for one in BY_NAME if one.startswith(f'{name}-')]
+        chosen += [name, *variants] if name in BY_NAME or not variants else variants
+    return chosen

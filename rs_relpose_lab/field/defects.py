@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.field.recording import FieldRecording, Gray, Samples
 from rs_relpose_lab.simulation.scene import make_texture
+from rs_relpose_lab.simulation.simulation import GRAVITY
 from rs_relpose_lab.simulation.turned import turned_axes, turned_camera
 from rs_relpose_ros.geometry import Array
 
@@ -86,6 +87,20 @@ def accelerometer_clock(recording: FieldRecording, seconds: float) -> FieldRecor
         frame_ids=('accel_optical_frame',),
     )
     return replace(recording, imu=gyro, accel=accel)
+
+
+def wrapped_clock(recording: FieldRecording, seconds: float, after: float) -> FieldRecording:
+    """Both clocks are set back by `seconds` after `after` seconds; truth stays as it is."""
+    imu, back = recording.imu, round(seconds * NS)
+    later = recording.seconds(imu.stamps_ns) >= after
+    stamps = imu.stamps_ns - np.where(later, back, 0)
+    wrapped = recording.shift_images(lambda t: np.where(t >= after, -back, 0))
+    return replace(wrapped, imu=replace(imu, stamps_ns=stamps))
+
+
+def overflowing_nanoseconds(recording: FieldRecording) -> FieldRecording:
+    """The driver of the camera writes all nanoseconds, of which 32 bits are left."""
+    return replace(recording, stamp_fields=lambda ns: (ns // 1_000_000_000, ns % 2**32))
 
 
 def bursts(recording: FieldRecording, size: int, stamped: str) -> FieldRecording:
@@ -200,6 +215,16 @@ def accel_factor(recording: FieldRecording, factor: float) -> FieldRecording:
     return replace(recording, imu=replace(imu, accel=factor * imu.accel))
 
 
+def gravity_removed(recording: FieldRecording) -> FieldRecording:
+    """The accelerometer's driver subtracts gravity by its own attitude, which is right."""
+    imu = recording.imu
+    assert imu.accel is not None
+    R_camera_imu = Rotation.from_quat(recording.parameters['quat_cam_imu_xyzw']).as_matrix()
+    R_world_imu = recording.states(imu.stamps_ns).R_world_cam @ R_camera_imu
+    gravity = GRAVITY @ R_world_imu  # rows of (N, 3), in the axes of the IMU
+    return replace(recording, imu=replace(imu, accel=imu.accel + gravity))
+
+
 def two_imus(recording: FieldRecording) -> FieldRecording:
     """A second IMU, rotated by a quarter turn, publishes on the same topic."""
     imu = recording.imu
@@ -224,7 +249,10 @@ def two_imus(recording: FieldRecording) -> FieldRecording:
 
 
 def low_pass(recording: FieldRecording, gyro: float, accel: float) -> FieldRecording:
-    """First-order low-pass filters with time constants [s] in both sensors."""
+    """First-order low-pass filters with time constants [s] in both sensors.
+
+    The true offset of the gyro is that of its filter's delay at low frequencies.
+    """
     imu = recording.imu
     assert imu.gyro is not None
     assert imu.accel is not None
@@ -237,9 +265,12 @@ def low_pass(recording: FieldRecording, gyro: float, accel: float) -> FieldRecor
             out[k] = out[k - 1] + gain * (values[k] - out[k - 1])
         return out
 
+    late = step / math.expm1(step / gyro)
+    truth = {**recording.truth, 'time_offset_s': recording.truth['time_offset_s'] + late}
     return replace(
         recording,
         imu=replace(imu, gyro=filtered(imu.gyro, gyro), accel=filtered(imu.accel, accel)),
+        truth=truth,
     )
 
 
@@ -262,7 +293,7 @@ def stabilised(recording: FieldRecording, share: float, limit: float) -> FieldRe
         warped = cv2.warpAffine(pixels, matrix, size, borderMode=cv2.BORDER_REPLICATE)
         return warped.astype(np.uint8, copy=False)
 
-    return recording.map_images(moved)
+    return recording.map_images(moved).without_truth('principal_point_px')
 
 
 # -- geometry of the image ----------------------------------------------------------------------
@@ -271,7 +302,12 @@ def stabilised(recording: FieldRecording, share: float, limit: float) -> FieldRe
 def cropped(recording: FieldRecording, left: int) -> FieldRecording:
     """`left` columns are cut off, and the CameraInfo keeps the principal point."""
     camera = replace(recording.camera, width=recording.camera.width - left)
-    return replace(recording.map_images(lambda _, pixels: pixels[:, left:]), camera=camera)
+    column, row = recording.truth['principal_point_px']
+    return replace(
+        recording.map_images(lambda _, pixels: pixels[:, left:]),
+        camera=camera,
+        truth={**recording.truth, 'principal_point_px': [column - left, row]},
+    )
 
 
 def matrix_scaled(recording: FieldRecording, factor: float) -> FieldRecording:
@@ -279,6 +315,13 @@ def matrix_scaled(recording: FieldRecording, factor: float) -> FieldRecording:
     camera = recording.camera
     values = {name: factor * getattr(camera, name) for name in ('fx', 'fy', 'cx', 'cy')}
     return replace(recording, camera=replace(camera, **values))
+
+
+def focal_scaled(recording: FieldRecording, factor: float) -> FieldRecording:
+    """The focal length of the CameraInfo is off by a factor."""
+    camera = recording.camera
+    off = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    return replace(recording, camera=off)
 
 
 def squeezed(recording: FieldRecording, factor: float) -> FieldRecording:
@@ -290,9 +333,12 @@ def squeezed(recording: FieldRecording, factor: float) -> FieldRecording:
         size = (width, camera.height)
         return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
+    cx = factor * (camera.cx + 0.5) - 0.5
+    lens = {'focal_px': factor * camera.fx, 'principal_point_px': [cx, camera.cy]}
     return replace(
         recording.map_images(resized),
-        camera=replace(camera, width=width, cx=factor * (camera.cx + 0.5) - 0.5),
+        camera=replace(camera, width=width, cx=cx),
+        truth={**recording.truth, **lens},
     )
 
 
@@ -313,13 +359,15 @@ def portrait(recording: FieldRecording, turns: int, *, configured: bool = False)
         parameters['readout_direction'] = camera.readout_direction
         parameters['stamp_row'] = camera.reference_row
     turned = recording.map_images(lambda _, pixels: np.rot90(pixels, turns))
-    truth = {**recording.truth, 'quat_cam_imu_xyzw': quat}
+    lens = {'focal_px': camera.fx, 'principal_point_px': [camera.cx, camera.cy]}
+    truth = {**recording.truth, 'quat_cam_imu_xyzw': quat, **lens}
     return replace(turned, camera=camera, R_camera_image=R, truth=truth, parameters=parameters)
 
 
 def mirrored(recording: FieldRecording) -> FieldRecording:
     """Columns are in reverse order."""
-    return recording.map_images(lambda _, pixels: pixels[:, ::-1])
+    mirrored_images = recording.map_images(lambda _, pixels: pixels[:, ::-1])
+    return mirrored_images.without_truth('principal_point_px')
 
 
 def zooming(recording: FieldRecording, share: float) -> FieldRecording:
@@ -339,7 +387,7 @@ def zooming(recording: FieldRecording, share: float) -> FieldRecording:
             pixels, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         ).astype(np.uint8, copy=False)
 
-    return recording.map_images(zoomed)
+    return recording.map_images(zoomed).without_truth('focal_px')
 
 
 def side_by_side(recording: FieldRecording) -> FieldRecording:
@@ -352,7 +400,8 @@ def side_by_side(recording: FieldRecording) -> FieldRecording:
         return np.hstack([pixels, other])
 
     wide = replace(camera, width=2 * camera.width, cx=camera.cx + 0.5 * camera.width)
-    return replace(recording.map_images(doubled), camera=wide)
+    both = recording.map_images(doubled).without_truth('focal_px', 'principal_point_px')
+    return replace(both, camera=wide)
 
 
 def overlay(recording: FieldRecording, share: float, side: str) -> FieldRecording:

@@ -35,6 +35,10 @@ JPEG_QUALITY = 92
 ACCEL_TOPIC = '/imu/accel'
 
 
+def _split(stamp_ns: int) -> tuple[int, int]:
+    return divmod(stamp_ns, 1_000_000_000)
+
+
 @dataclass(frozen=True, slots=True)
 class Shot:
     """One image message."""
@@ -94,6 +98,8 @@ class FieldRecording:
     truth_stamps_ns: Stamps
     # Changes the fields of a CameraInfo message before it is written.
     info_fields: dict[str, Any] = field(default_factory=dict)
+    # sec and nanosec in headers of images, of a stamp [ns].
+    stamp_fields: Callable[[int], tuple[int, int]] = _split
 
     @property
     def start_ns(self) -> int:
@@ -119,6 +125,11 @@ class FieldRecording:
             shot.with_pixels(change(number, shot.pixels)) for number, shot in enumerate(self.shots)
         )
         return replace(self, shots=shots)
+
+    def without_truth(self, *names: str) -> FieldRecording:
+        """The recording without true values that a defect leaves undefined."""
+        truth = {name: value for name, value in self.truth.items() if name not in names}
+        return replace(self, truth=truth)
 
     def configured(self, **parameters: Any) -> FieldRecording:
         """The recording with other values in its parameter file."""
@@ -161,6 +172,9 @@ def base_recording(config: SimulationConfig, folder: Path) -> FieldRecording:
             'time_offset_s': config.time_offset,
             'gyro_bias_rad_per_s': list(config.gyro_bias),
             'quat_cam_imu_xyzw': list(config.quat_cam_imu_xyzw),
+            'focal_px': simulation.camera.fx,
+            'principal_point_px': [simulation.camera.cx, simulation.camera.cy],
+            'exposure_s': config.exposure_time,
         },
         R_camera_image=np.eye(3),
         states=simulation.states,
@@ -193,10 +207,13 @@ def _image_entries(recording: FieldRecording, bag: BagWriter) -> Any:
         )
         for name, value in recording.info_fields.items():
             setattr(info, name, value)
-        yield shot.receive_ns, sensor_topics.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         image = outgoing.encoded_image_message(
             shot.stamp_ns, sensor_topics.CAMERA_FRAME, shot.data, bag.type
         )
+        for message in (info, image):
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = recording.stamp_fields(shot.stamp_ns)
+        yield shot.receive_ns, sensor_topics.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         yield (
             shot.receive_ns,
             sensor_topics.COMPRESSED_TOPIC,

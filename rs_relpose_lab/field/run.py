@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 import shutil
 import time
@@ -10,8 +11,11 @@ from typing import NamedTuple
 
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
 from rs_relpose_lab.field.cases import BASES, BY_NAME, Case
-from rs_relpose_lab.field.recording import base_recording, write_recording
-from rs_relpose_lab.field.verdict import answers, judge, pose_distances, run_command, Verdict
+from rs_relpose_lab.field.evidence import Evidence
+from rs_relpose_lab.field.offline import answers, evidence_of, replayed_poses, run_command
+from rs_relpose_lab.field.recording import base_recording, FieldRecording, write_recording
+from rs_relpose_lab.field.truth import pose_distances
+from rs_relpose_lab.field.verdict import judge, Verdict
 
 
 class Task(NamedTuple):
@@ -19,6 +23,7 @@ class Task(NamedTuple):
 
     name: str
     output: Path
+    live: bool = False  # played to running nodes, in place of the commands
 
 
 def prepare_bases(tasks: Sequence[Task]) -> None:
@@ -29,49 +34,65 @@ def prepare_bases(tasks: Sequence[Task]) -> None:
     for task in tasks:
         case = BY_NAME[task.name]
         base_recording(BASES[case.base], task.output / 'bases' / case.base)
-        if case.solvable:
+        if not task.live:
             _undisturbed_poses(case, task.output)
 
 
 def run_case(task: Task) -> Verdict:
-    """Make the recording of a case, run the commands on it, and judge their answers."""
+    """Make the recording of a case, have it answered, and judge the answers."""
     case, output = BY_NAME[task.name], task.output
     base = base_recording(BASES[case.base], output / 'bases' / case.base)
     recording = case.change(base)
-    folder = (output / 'cases' / case.name).resolve()
+    folder = (output / ('live' if task.live else 'cases') / case.name).resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     bag = folder / 'bag'
     parameters = write_recording(recording, bag)
     started = time.monotonic()
-    found = answers(case, folder, bag, parameters)
+    answered = _by_nodes if task.live else _by_commands
+    evidence = answered(case, recording, bag, parameters)
     seconds = time.monotonic() - started
+    # Live, all pairs of images that are no repetition would have a pose.
+    undisturbed = evidence.pairs if task.live else _undisturbed_poses(case, output)
+    verdict = judge(case, evidence, undisturbed, seconds)
+    # Bags are large, and they can be made again.
+    shutil.rmtree(bag, ignore_errors=True)
+    return replace(verdict, case=f'{case.name} live') if task.live else verdict
+
+
+def _by_commands(case: Case, recording: FieldRecording, bag: Path, parameters: Path) -> Evidence:
+    folder = bag.parent
+    found = answers(case, folder, bag, parameters)
     for name, answer in found.items():
         text = f'exit code {answer.code}\n{answer.text}'
         (folder / f'{name}.txt').write_text(text, encoding='utf-8')
-    undisturbed = _undisturbed_poses(case, output) if case.solvable else None
-    verdict = judge(case, recording, folder, found, undisturbed, seconds)
-    # Bags are large, and they can be made again.
-    shutil.rmtree(bag, ignore_errors=True)
-    return verdict
+    return evidence_of(recording, folder, found)
 
 
-def _undisturbed_poses(case: Case, output: Path) -> int:
-    """Number of poses of the base recording, replayed once."""
+def _by_nodes(_: Case, recording: FieldRecording, bag: Path, parameters: Path) -> Evidence:
+    from rs_relpose_lab.field.live import play  # it needs ROS
+
+    return play(recording, bag, parameters, bag.parent)
+
+
+def _undisturbed_poses(case: Case, output: Path) -> int | None:
+    """Number of poses of the base recording, replayed once; None where they do not count."""
+    if not case.solvable:
+        return None
     folder = (output / 'bases' / case.base).resolve()
     base = base_recording(BASES[case.base], folder)
     replayed = folder / 'replay'
     if not (replayed / 'summary.json').exists():
         words = ('replay', str(folder / 'bag'), '--params', str(folder / 'bag.yaml'))
         run_command(folder, *words, '--out', str(replayed), '--bag', '--no-pictures')
-    return len(pose_distances(base, folder)[0])
+    return len(pose_distances(base, replayed_poses(replayed)))
 
 
 def report(output: Path, verdicts: Sequence[Verdict]) -> str:
     """Write the table of verdicts, and return it."""
     header = (
         *('case', 'verdict', 'poses of pairs', 'beyond', 'worst', 'calibrate', 'odometry beyond'),
-        *('named', 'reason'),
+        *('named', 'findings', 'reason'),
     )
     rows = [
         (
@@ -81,8 +102,9 @@ def report(output: Path, verdicts: Sequence[Verdict]) -> str:
             f'{100.0 * one.beyond:.1f} %',
             f'{one.worst:.1f}',
             f'{one.calibration:.1f}',
-            f'{100.0 * one.states_beyond:.0f} %',
+            f'{100.0 * one.states_beyond:.0f} % of {one.states}',
             one.named[:24],
+            one.faults,
             one.reason,
         )
         for one in verdicts

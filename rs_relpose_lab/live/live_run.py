@@ -32,7 +32,7 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
 
     Returns the tables of the published poses and of the stamps of the processed frames.
     """
-    remap, duration = _remap_and_duration(bag)
+    remap, duration = remap_and_duration(bag)
     table, stamps = folder / 'live.csv', folder / 'live_stamps.txt'
     with (
         private_domain(),
@@ -60,7 +60,7 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
     return table, stamps
 
 
-def _remap_and_duration(bag: Path) -> tuple[dict[str, str], float]:
+def remap_and_duration(bag: Path) -> tuple[dict[str, str], float]:
     """Names of a node's topics in a bag, and the length of the bag [s]."""
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration
