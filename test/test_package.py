@@ -228,7 +228,7 @@ MAY_IMPORT_IN_THE_LABORATORY = {
     'simulation': set(),
     'live': {'simulation'},
     'experiments': {'simulation', 'live'},
-    'field': {'simulation', 'experiments'},
+    'field': {'simulation', 'live', 'experiments'},
     'cli': {'simulation', 'live', 'experiments', 'field'},
 }
 FREE_OF_ROS = (
