@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rs_relpose_ros.calibration.assessment import configured_sigmas
 from rs_relpose_ros.calibration.findings import (
     Assessment,
     Code,
+    Configured,
     Finding,
     FindingState,
     Why,
+    worst_of,
 )
 from rs_relpose_ros.calibration.findings_text import text_of
 from rs_relpose_ros.calibration.residual_maps import (
@@ -19,14 +22,19 @@ from rs_relpose_ros.calibration.residual_maps import (
     map_by_groups,
     maps_of,
     PairSums,
+    ResidualMaps,
     signed_residuals,
     summary_line,
     View,
     with_maps,
 )
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.matches import Matches
 from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.pipeline.monitor import ConsistencyMonitor
 
 FOCAL = 410.0
 SIGMA = 0.3  # [px]
@@ -85,18 +93,18 @@ def test_probabilities_of_noise_are_right():
 
 @pytest.mark.parametrize('cell', [0, 9, 23])
 def test_a_biased_cell_is_found(cell):
-    biased = []
+    moved = []
     for pair in walk():
         cells = pair.cells.copy()
         cells[1, cell] += 0.5 * pair.counts[cell]
-        biased.append(replace(pair, cells=cells))
-    found = by_name(biased)
+        moved.append(replace(pair, cells=cells))
+    found = by_name(moved)
     assert found['cells'].fails
     assert found['cells'].worst == 24 + cell
     assert found['cells'].mean == pytest.approx(0.5, abs=0.15)
     assert found['cells'].expectation[24 + cell] == 0.0
     column, row = cell % 6 + 1, cell // 6 + 1
-    health = with_maps(CONSISTENT, maps_of(biased))
+    health = with_maps(CONSISTENT, maps_of(moved))
     (fault,) = health.faults
     assert (fault.code, fault.state) == (Code.UNKNOWN_CAUSE, FindingState.SUSPECT)
     assert fault.candidates == CANDIDATES['cells']
@@ -107,11 +115,11 @@ def test_a_biased_cell_is_found(cell):
 
 
 def test_the_readout_shows_in_rows_at_a_changing_rate():
-    biased = [
+    turned = [
         replace(one, bands=one.bands + 0.6 * (one.change > 0.6) * one.band_counts * SLOPE)
         for one in walk()
     ]
-    found = by_name(biased)
+    found = by_name(turned)
     assert [name for name, one in found.items() if one.fails] == ['rows_rate']
     label = found['rows_rate'].labels[found['rows_rate'].worst]
     assert label in (
@@ -178,9 +186,114 @@ def test_few_pairs_are_not_tested():
 
 def test_a_named_parameter_is_not_joined_by_an_unknown_cause():
     named = Assessment((Finding(Code.DISTORTION, FindingState.SUSPECT, Why.OFF),))
-    biased = [replace(one, cells=one.cells + one.counts) for one in walk()]
-    assert maps_of(biased)[0].fails
-    assert with_maps(named, maps_of(biased)) is named
+    maps = maps_of([replace(one, cells=one.cells + one.counts) for one in walk()])
+    assert maps[0].fails
+    assert with_maps(named, maps) is named
+
+
+# -- Live: the last seconds, and what the monitor makes of them --------------------------------
+
+
+def biased(pairs, cell=5):
+    """The pairs with the residuals of a cell of the image moved by half a sigma."""
+    moved = np.zeros((3, 24))
+    moved[0, cell] = 0.5
+    return [replace(one, cells=one.cells + moved * one.counts) for one in pairs]
+
+
+def follow(maps, pairs):
+    """Seconds from the first pair on at which a test has found a pattern."""
+    found = []
+    for one in pairs:
+        maps.add(one)
+        maps.test_in_turn()
+        if maps.added_to(CONSISTENT).faults:
+            found.append(one.stamp_ns * 1e-9 - 1.0)
+    return found
+
+
+def test_live_the_last_seconds_are_tested_now_and_then(monkeypatch):
+    tests = []
+    monkeypatch.setattr(ResidualMaps, 'maps', counted(ResidualMaps.maps, tests))
+    wrong = biased(walk())
+    later = [replace(one, stamp_ns=one.stamp_ns + 30 * 10**9) for one in walk(40.0, seed=1)]
+    found = follow(ResidualMaps.of_last_seconds(), [*wrong, *later])
+    assert 3.0 < found[0] < 10.0
+    # Pairs without a pattern follow from 30 s on: none of the others is known 20 s later.
+    assert 30.0 < found[-1] < 53.0
+    assert 20 < len(tests) < 35
+    assert not follow(ResidualMaps.of_last_seconds(), walk(60.0, seed=2))
+
+
+def counted(function, calls):
+    def call(*arguments):
+        calls.append(arguments)
+        return function(*arguments)
+
+    return call
+
+
+def test_live_and_offline_have_the_same_maps():
+    live, offline = ResidualMaps.of_last_seconds(), ResidualMaps()
+    for one in walk(12.0):
+        live.add(one)
+        offline.add(one)
+        offline.add(None)
+    assert [one.p for one in live.maps()] == [one.p for one in offline.maps()]
+    live.clear()
+    assert not live.maps()
+
+
+PARAMETERS = Parameters.from_mapping({'readout_time': 0.03, 'quat_cam_imu_xyzw': (0, 0, 0, 1)})
+CAMERA = RollingShutterCamera(
+    width=560, height=420, fx=FOCAL, fy=FOCAL, cx=280.0, cy=210.0, readout_time=0.03
+)
+
+
+def monitored(pairs, image_findings=()):
+    """Health by a monitor that has the residuals of pairs and nothing else."""
+    monitor = ConsistencyMonitor()
+    monitor.image_findings = image_findings
+    configured = Configured(
+        PARAMETERS.sensor,
+        CAMERA,
+        np.zeros(3),
+        configured_sigmas(PARAMETERS, 0.0, CAMERA),
+        np.zeros(LIVE.size),
+    )
+    pose = RelativePose(Status.NO_CONSENSUS)
+    for one in pairs:
+        monitor.residuals.add(one)
+        monitor.add_pair(one.stamp_ns, None, pose, configured)
+        monitor.assess()
+    return monitor
+
+
+def test_the_monitor_reports_a_pattern_as_an_unknown_cause():
+    monitor = monitored(biased(walk()))
+    (fault,) = monitor.health.faults
+    assert (fault.code, fault.why) == (Code.UNKNOWN_CAUSE, Why.RESIDUALS)
+    assert fault.evidence.measured['map'] == 'cells'
+    assert fault.candidates == CANDIDATES['cells']
+    monitor.restart()  # after a step of a clock
+    assert not monitor.residuals.maps()
+
+
+def test_a_named_cause_explains_a_pattern():
+    masked = Finding(Code.STATIC_REGION, FindingState.SUSPECT, Why.STILL)
+    monitor = monitored(biased(walk()), (masked,))
+    assert monitor.health.faults == (masked,)
+    assert not monitored(walk()).health.faults
+
+
+def test_in_a_run_a_pattern_does_not_stand_beside_what_is_found_later():
+    """It is no reason, either, to forget what was found before."""
+    pattern = with_maps(CONSISTENT, maps_of(biased(walk())))
+    named = Assessment((Finding(Code.DISTORTION, FindingState.SUSPECT, Why.OFF),))
+    codes = [one.code for one in worst_of(pattern, named).faults]
+    assert codes == [Code.DISTORTION]
+    both = worst_of(named, pattern).faults
+    assert {one.code for one in both} == {Code.DISTORTION, Code.UNKNOWN_CAUSE}
 
 
 def rendered(shift):

@@ -250,7 +250,8 @@ class Assessment:
         return {
             one.code
             for one in self.findings
-            if one.code in _DISTURBING or one.why is Why.AT_OTHER_TIME
+            if (one.code in _DISTURBING and one.why is not Why.RESIDUALS)
+            or one.why is Why.AT_OTHER_TIME
         }
 
     @property
@@ -268,14 +269,17 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
 
     If `now` has a gross error, masks a part of the image, or has a change of the offset or pairs
     without an explanation, and `before` had not, earlier findings were its traces and are dropped.
-    So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`).
+    So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`), and a
+    pattern of residuals once anything else is found, which explains it.
     """
     traces = (
         (now.is_gross and not before.is_gross)
         or (now.masks and not before.masks)
         or now.is_disturbed_since(before)
     )
-    found = {} if traces else {finding.code: finding for finding in before.findings}
+    kept = () if traces else before.findings
+    is_explained = any(one.why is not Why.RESIDUALS for one in now.faults)
+    found = {one.code: one for one in kept if not (is_explained and one.why is Why.RESIDUALS)}
     # A quantity that was observable once is not unknown any more.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any, NamedTuple
+import sys
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,13 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
+from rs_relpose_ros.calibration.posterior import LastSeconds, WINDOW_NS
 from rs_relpose_ros.core.losses import SIGMA_PER_MEDIAN
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.matches import Matches
-from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 # Probability below which a map fails. A larger one would doubt correct recordings, a smaller one
 # would miss errors of 20 s. [derived: four maps a minute are below it once in 400 hours by chance]
@@ -77,6 +80,12 @@ _BOUND_OF_ROTATION = 3.0
 _TINY = 1e-12
 # Components of a residual, in the order of `PairSums.cells`. [derived: text for people]
 _COMPONENTS = ('along the motion', 'across the motion', 'along the change of the rotation')
+# Pairs of the last seconds that are kept. It bounds the time of a test; with fewer, keyframes at
+# 10 Hz would not fill the window. [chosen: 150 to 400 would do]
+_MOST_LIVE = 200
+# Time from one test of the last seconds to the next [ns]. More tests cost time and find a pattern
+# hardly earlier, as each pair is in many of them. [chosen: a block of time]
+_TEST_EVERY_NS = to_nanoseconds(_BLOCK)
 # Least probability that is given: smaller ones are not those of a Student distribution.
 _LEAST_P = 1e-300
 
@@ -116,17 +125,22 @@ def signed_residuals(pose: RelativePose, matches: Matches) -> SignedResiduals:
     moved_1 = np.outer(matches.row_times[0], pose.linear_velocity1)
     moved_2 = np.outer(matches.row_times[-1], velocity_2)
     baselines = pose.t + moved_2 - moved_1
-    normals = np.cross(baselines, second)
+    normals = _crossed(baselines, second)
     values = np.einsum('ij,ij->i', first, normals)
     by_first = normals - values[:, None] * first
-    by_second = np.cross(first, baselines)
+    by_second = _crossed(first, baselines)
     radial = np.einsum('ij,ij->i', by_second, second)
     by_second = by_second - radial[:, None] * second
-    length_1 = np.linalg.norm(by_first, axis=1)
-    length_2 = np.linalg.norm(by_second, axis=1)
+    length_1, length_2 = _lengths(by_first), _lengths(by_second)
     length = np.maximum(np.hypot(length_1, length_2), _TINY)
     directions = by_second / np.maximum(length_2, _TINY)[:, None]
     return SignedResiduals(values / length, directions @ pose.R)
+
+
+def _crossed(a: Array, b: Array) -> Array:
+    """Cross products (N, 3) of vectors (N, 3), in a third of the time of `np.cross`."""
+    ahead, behind = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[:, ahead] * b[:, behind] - a[:, behind] * b[:, ahead])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,41 +166,43 @@ class PairSums:
         images_against_gyro: Array | None,
     ) -> PairSums | None:
         """The sums of the inliers; `focal_length` [px]. None without a pose and its rates."""
+        if not pose:
+            return None
         change = pose.angular_velocity2 - pose.R.T @ pose.angular_velocity1
         sigma = pose.diagnostics.pixel_sigma / focal_length
-        if not pose or not np.isfinite(change).all() or not sigma > 0.0:
+        if not np.isfinite(change).all() or not sigma > 0.0:
             return None
         found = signed_residuals(pose, matches)
         use = pose.inliers & np.isfinite(found.values)
         bounded = np.clip(found.values[use] / sigma, -_BOUND, _BOUND)
-        components = _components(
-            found.directions[use],
-            matches.points2[use] - matches.points1[use],
-            np.cross(matches.rays[-1][use], change),
-        )
-        values = components * bounded
-        share = matches.points2[use] / (view.width, view.height)
-        column, row = (
-            np.clip((share[:, axis] * parts).astype(np.int64), 0, parts - 1)
-            for axis, parts in ((0, COLUMNS), (1, ROWS))
-        )
-        band = np.clip((share[:, view.readout_axis] * _BANDS).astype(np.int64), 0, _BANDS - 1)
-        cell, size = row * COLUMNS + column, ROWS * COLUMNS
+        points2 = matches.points2[use]
+        turning = matches.rays[-1][use] @ skew(-change).T  # times the change of the rotation
+        motions = points2 - matches.points1[use]
+        values = bounded * _components(found.directions[use], motions, turning)
+        share = points2 / (view.width, view.height)
+        place = _parts(share, np.array([COLUMNS, ROWS]))
+        band = _parts(share[:, view.readout_axis], np.array(_BANDS))
+        cell, size = place @ (1, COLUMNS), ROWS * COLUMNS
         rate = float(np.linalg.norm(change))
         axis = pose.R @ change / max(rate, _TINY)
         return cls(
             stamp_ns,
             np.array([_summed(cell, one, size) for one in values]),
-            _summed(cell, np.ones(len(cell)), size),
+            _summed(cell, None, size),
             _summed(band, values[2], _BANDS),
-            _summed(band, np.ones(len(band)), _BANDS),
+            _summed(band, None, _BANDS),
             rate,
             math.nan if images_against_gyro is None else float(images_against_gyro @ axis),
         )
 
 
-def _summed(cells: NDArray[np.int64], values: Array, size: int) -> Array:
-    """Sums (size,) of values (N,) by their cells (N,)."""
+def _parts(share: Array, parts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which of equal parts of [0, 1] shares (N, ...) lie in, for each coordinate."""
+    return np.clip((share * parts).astype(np.int64), 0, parts - 1)
+
+
+def _summed(cells: NDArray[np.int64], values: Array | None, size: int) -> Array:
+    """Sums (size,) of values (N,) by their cells (N,), or their numbers."""
     return np.asarray(np.bincount(cells, values, size), dtype=float)
 
 
@@ -206,8 +222,13 @@ def _components(directions: Array, motions: Array, turning: Array) -> Array:
 
 def _of_length_1(vectors: Array) -> Array:
     """Vectors (N, K) over their lengths; zero where they have none."""
-    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = _lengths(vectors)
     return np.asarray(vectors / np.maximum(lengths, _TINY)[:, None])
+
+
+def _lengths(vectors: Array) -> Array:
+    """Lengths (N,) of vectors (N, K)."""
+    return np.asarray(np.sqrt(np.einsum('ij,ij->i', vectors, vectors)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,10 +366,11 @@ def _of_rows(pairs: Sequence[PairSums], groups: NDArray[np.int64]) -> ResidualMa
     At a constant rate a wrong readout time moves the points of both images nearly alike.
     """
     classes = len(_CHANGES) + 1
+    at = np.searchsorted(_CHANGES, [pair.change for pair in pairs])
+    rows = np.arange(len(pairs))
     sums, counts = np.zeros((2, len(pairs), classes, _BANDS))
-    for k, pair in enumerate(pairs):
-        at = int(np.searchsorted(_CHANGES, pair.change))
-        sums[k, at], counts[k, at] = pair.bands, pair.band_counts
+    sums[rows, at] = [pair.bands for pair in pairs]
+    counts[rows, at] = [pair.band_counts for pair in pairs]
     borders = ('0', *(f'{one:g}' for one in _CHANGES))
     labels = tuple(
         f'part {band + 1} of {_BANDS} of the readout, change of the rate from {low} rad/s'
@@ -372,7 +394,7 @@ def _of_time(pairs: Sequence[PairSums], seconds: Array) -> ResidualMap:
     known = np.isfinite(rotations)
     blocks, values = all_blocks[known], rotations[known]
     total = _summed(blocks, values, size)
-    number = _summed(blocks, np.ones(len(blocks)), size)
+    number = _summed(blocks, None, size)
     means = total / np.maximum(number, 1.0)
     left = values - means[blocks]
     free = len(values) - int((number > 0.0).sum())
@@ -417,6 +439,49 @@ def _of_halves(
     labels = tuple(f'{name}, {component}' for name, *_ in halves for component in _COMPONENTS)
     per_component = np.repeat(np.stack(numbers, axis=1), len(_COMPONENTS), axis=1)
     return map_by_groups('halves', labels, np.concatenate(sums, axis=1), per_component, groups)
+
+
+class ResidualMaps:
+    """Sums of pairs in the order of time, and what their maps show.
+
+    Offline they are of all pairs of a recording, live of the last seconds (`of_last_seconds`).
+    """
+
+    def __init__(self, most: int = sys.maxsize, window_ns: int = sys.maxsize) -> None:
+        self._pairs = LastSeconds(most, window_ns)
+        self._tested_ns: int | None = None  # stamp of the last pair of the last test
+        self._maps: tuple[ResidualMap, ...] = ()
+
+    @classmethod
+    def of_last_seconds(cls) -> Self:
+        """The maps of a recording that goes on."""
+        return cls(_MOST_LIVE, WINDOW_NS)
+
+    def add(self, sums: PairSums | None) -> None:
+        """Add a pair; None: it has no residuals."""
+        if sums is not None:
+            self._pairs.keep((sums.stamp_ns, sums))
+
+    def clear(self) -> None:
+        """Forget the pairs: those that come have another configuration."""
+        self._pairs.clear()
+        self._tested_ns, self._maps = None, ()
+
+    def maps(self) -> tuple[ResidualMap, ...]:
+        """The maps of the pairs so far."""
+        return maps_of([sums for _, sums in self._pairs])
+
+    def test_in_turn(self) -> None:
+        """Test the pairs, unless it was done a short time ago."""
+        if not self._pairs:
+            return
+        newest_ns = self._pairs[-1][0]
+        if self._tested_ns is None or newest_ns - self._tested_ns >= _TEST_EVERY_NS:
+            self._tested_ns, self._maps = newest_ns, self.maps()
+
+    def added_to(self, health: Assessment) -> Assessment:
+        """The assessment with a finding by the last test, if nothing else is found."""
+        return with_maps(health, self._maps)
 
 
 def with_maps(health: Assessment, maps: Sequence[ResidualMap]) -> Assessment:

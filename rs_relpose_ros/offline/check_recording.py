@@ -29,7 +29,7 @@ from rs_relpose_ros.calibration.findings import (
     FindingState,
     Why,
 )
-from rs_relpose_ros.calibration.residual_maps import maps_of, PairSums, with_maps
+from rs_relpose_ros.calibration.residual_maps import ResidualMaps, with_maps
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -429,7 +429,7 @@ def sampled(
     frames = part_since_ns = last_ns = 0
     before = findings.NOT_EVALUATED  # of the settled parts
     intake = Intake(front_end.sequencer, parameters)
-    sums: list[PairSums] = []
+    residuals = ResidualMaps()
     for outcome in outcomes(front_end, intake, chosen):
         if isinstance(outcome, MessageRefused):
             unused.add(str(outcome.error))
@@ -442,7 +442,7 @@ def sampled(
         if (pair := outcome.result) is None:
             continue
         poses += bool(pair.pose)
-        sums += pair.residual_sums(intake.intrinsics)
+        residuals.add(pair.residual_sums)
         if not pair.pose:
             poseless.add(pair.pose.reason)
         if not matches or not 0 <= pair.stamp_ns - last_ns < _APART_NS:
@@ -451,7 +451,7 @@ def sampled(
             before = findings.worst_of(before, front_end.health)
         matches.append(len(pair.matches))
         last_ns = pair.stamp_ns
-    health = with_maps(findings.worst_of(before, front_end.health), maps_of(sums))
+    health = with_maps(findings.worst_of(before, front_end.health), residuals.maps())
     is_refused = frames < _FEW_USED * counts['handed']
     return Sample(frames, matches, poses, poseless if matches else unused, health, is_refused)
 

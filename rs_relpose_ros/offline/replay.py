@@ -23,9 +23,8 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.findings_text import summary_json, summary_lines
 from rs_relpose_ros.calibration.residual_maps import (
-    maps_of,
-    PairSums,
     ResidualMap,
+    ResidualMaps,
     summary_line,
     with_maps,
 )
@@ -243,7 +242,7 @@ def replay_into(
         refuse_existing(out_bag)
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE, *PICTURES))
     records: list[PairRecord] = []
-    sums: list[PairSums] = []
+    residuals = ResidualMaps()
     shown: PairResult | None = None
     last = None
     health = NOT_EVALUATED
@@ -255,7 +254,7 @@ def replay_into(
         for pair in run.pairs():
             records.append(PairRecord.of(pair, truth))
             last = pair
-            sums += pair.residual_sums(run.intake.intrinsics)
+            residuals.add(pair.residual_sums)
             health = worst_of(health, pair.health)
             write_record(records[-1])
             if writer is not None:
@@ -268,7 +267,7 @@ def replay_into(
             if pictures and (shown is None or rank > best):
                 shown = pair
                 best = rank
-    maps = maps_of(sums)
+    maps = residuals.maps()
     health = with_maps(worst_of(health, run.health), maps)
     files = [folder / table.file for table in written] + [out_bag] * with_bag
     if shown is not None:

@@ -26,6 +26,7 @@ from rs_relpose_ros.calibration.findings import (
 )
 from rs_relpose_ros.calibration.posterior import Calibration, Posterior
 from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
+from rs_relpose_ros.calibration.residual_maps import ResidualMaps
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
 from rs_relpose_ros.calibration.second_motion import SecondMotions
 from rs_relpose_ros.config.settings import SensorConfig
@@ -100,6 +101,7 @@ class ConsistencyMonitor:
         self.clock_steps = ClockSteps()
         self.second_motions = SecondMotions()
         self.contradictions = Contradictions()
+        self.residuals = ResidualMaps.of_last_seconds()
         self._step: tuple[int, Finding] | None = None  # the last one, with the stamp of its end
         self._drift: Finding | None = None  # that is followed
         self.change: Change | None = None  # by the pairs so far, not followed yet
@@ -242,6 +244,10 @@ class ConsistencyMonitor:
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
+        self.residuals.test_in_turn()
+        # Residuals differ as rotations do where a parameter deviates within its stated sigma.
+        if not self.deviates_as_allowed(configured):
+            self.health = self.residuals.added_to(self.health)
 
     def _find_inconsistencies(self, configured: Configured) -> None:
         """Find which quantities are off, or change, by all pairs so far."""
@@ -321,6 +327,7 @@ class ConsistencyMonitor:
             self._drift = _finding_of_drift(Code.OFFSET_DRIFT, change, drift, 's/s')
         self._recursion.follow_offsets(offsets, first)
         self.calibration = self._recursion.solved()
+        self.residuals.clear()
         self._inconsistent, self.change = [], None
         self._likely, self._undetermined = np.zeros(LIVE.size), None
         self._due = None
@@ -343,6 +350,7 @@ class ConsistencyMonitor:
         self.rotations.clear()
         self.acceleration.clear()
         self.contradictions.clear()
+        self.residuals.clear()
         self._directions.clear()
         self.clock_steps.end_doubt()
         self._inconsistent, self._gross = [], ()

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED
-from rs_relpose_ros.calibration.residual_maps import PairSums, View
+from rs_relpose_ros.calibration.residual_maps import PairSums
 from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
@@ -137,6 +137,8 @@ class Learned:
     images_by_deviation: Array | None = None
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
+    # What its residuals add to their maps, also where its pose is withheld; None without a pose
+    residual_sums: PairSums | None = None
     # Tracked calibration, and the corrections that follow from it, after this pair.
     tracked: Tracked | None = None
     applied: Applied = field(default_factory=Applied)
@@ -217,20 +219,10 @@ class PairResult:
         """Corrections of the next frames, which follow from the tracked calibration."""
         return self.lesson().applied
 
-    def residual_sums(self, intrinsics: Intrinsics | None) -> list[PairSums]:
-        """What the pair adds to the maps of residuals; empty without a pose."""
-        if intrinsics is None or not self.pose:
-            return []
-        view = View(intrinsics.image_width, intrinsics.image_height, self.readout_axis)
-        found = PairSums.of(
-            self.stamp_ns,
-            self.matches,
-            self.pose,
-            intrinsics.fx,
-            view,
-            self.images_against_gyro,
-        )
-        return [] if found is None else [found]
+    @property
+    def residual_sums(self) -> PairSums | None:
+        """What the pair adds to the maps of residuals; None without a pose."""
+        return self.lesson().residual_sums
 
     @property
     def gyro_difference(self) -> float:

@@ -16,6 +16,7 @@ from rs_relpose_ros.calibration.assessment import configured_sigmas
 from rs_relpose_ros.calibration.changes import BEYOND_JITTER
 from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import PairData
+from rs_relpose_ros.calibration.residual_maps import PairSums, View
 from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
 from rs_relpose_ros.config.settings import Parameters, sensor_model, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
@@ -377,6 +378,9 @@ class Pipeline(Processor[PairResult]):
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
+        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
+        sums_of = _residual_sums(frame, rays, pose, sensor)
+        self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured, sums_of))
         if parameters.pair.withhold_when_wrong:
             pose = suppressed(pose, monitor.health)
             if doubtful:
@@ -385,8 +389,6 @@ class Pipeline(Processor[PairResult]):
                 pose = withheld(pose, _CONTRADICTING)
             if follows_object:
                 pose = withheld(pose, _TWO_MOTIONS)
-        self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured))
-        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         return replace(
             history.result(frame, rays, pose, sensor, parameters),
             health=monitor.health,
@@ -394,8 +396,16 @@ class Pipeline(Processor[PairResult]):
             image2=frame.image if self._keep_images else None,
         )
 
-    def _learn(self, stamp_ns: int, configured: Configured) -> Learned:
-        """What the last pair tells of the configuration; updates the corrections."""
+    def _learn(
+        self,
+        stamp_ns: int,
+        configured: Configured,
+        sums_of: Callable[[Array | None], PairSums | None],
+    ) -> Learned:
+        """What the last pair tells of the configuration; updates the corrections.
+
+        `sums_of` gives the sums of its residuals by the rotation of images against the gyro's.
+        """
         monitor = self._monitor
         monitor.learn()
         of_images = None if monitor.latest is None else monitor.latest.images_by_deviation
@@ -403,7 +413,9 @@ class Pipeline(Processor[PairResult]):
         self._correct(stamp_ns, tracked, configured)
         latest = monitor.latest  # None after a step
         against_gyro = None if latest is None else latest.images_against_gyro
-        return Learned(of_images, against_gyro, tracked, self.applied)
+        sums = sums_of(against_gyro)
+        monitor.residuals.add(sums)
+        return Learned(of_images, against_gyro, sums, tracked, self.applied)
 
     def _correct(self, stamp_ns: int, tracked: Tracked, configured: Configured) -> None:
         """Move the corrections of the next frames towards the estimates, or by a step."""
@@ -478,6 +490,15 @@ class Pipeline(Processor[PairResult]):
             if used and not acceleration.uses(evidence):
                 pose = estimate(problem.without_inertial(_CONTRADICTED))
         return pose
+
+
+def _residual_sums(
+    frame: Frame[Any], rays: Matches, pose: RelativePose, sensor: Sensor
+) -> Callable[[Array | None], PairSums | None]:
+    """The sums of a pair's residuals, made when the rotation against the gyro is known."""
+    size = frame.intrinsics.image_width, frame.intrinsics.image_height
+    view = View(*size, sensor.camera.readout_axis)
+    return partial(PairSums.of, frame.stamp_ns, rays, pose, frame.intrinsics.fx, view)
 
 
 def _with_step(sensor: SensorConfig, seconds: float) -> SensorConfig:

@@ -17,9 +17,8 @@ from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.sensor_topics import Chosen, SensorTopics
 from rs_relpose_ros.calibration.findings import Assessment, FindingState, NOT_EVALUATED, worst_of
 from rs_relpose_ros.calibration.residual_maps import (
-    maps_of,
-    PairSums,
     ResidualMap,
+    ResidualMaps,
     with_maps,
 )
 from rs_relpose_ros.config.settings import Parameters
@@ -208,7 +207,7 @@ class _Run:
         self._rotations: dict[int, Rotation] = {}
         self.records: list[PairRecord] = []
         self.residuals: list[MatchResiduals] = []
-        self._sums: list[PairSums] = []
+        self._residual_maps = ResidualMaps()
         self.maps: tuple[ResidualMap, ...] = ()
         self.withheld = self.frames = 0
         self.health = NOT_EVALUATED
@@ -232,7 +231,7 @@ class _Run:
             if outcome.result is not None:
                 yield self._kept(outcome.result)
         self._note_health(self._front_end.health)
-        self.maps = maps_of(self._sums)
+        self.maps = self._residual_maps.maps()
         self.health = with_maps(self.health, self.maps)
 
     def _noted(
@@ -250,7 +249,7 @@ class _Run:
         self.records.append(PairRecord.of(replace(pair, image2=None), self.truth))
         if pair.pose:
             self.residuals.append(MatchResiduals.of(pair, self._focal_length))
-            self._sums += pair.residual_sums(self.intake.intrinsics)
+            self._residual_maps.add(pair.residual_sums)
         else:
             self._poseless.add(pair.pose.reason)
         self._note_health(pair.health)
