@@ -15,6 +15,7 @@ import pytest
 from test_package import imports, module_behind, MODULES, NAME
 
 from rs_relpose_ros.jit import source_digest, TRIED
+from rs_relpose_ros.pipeline.warm_up import look_up_symbols
 
 # A package of this name with two kernels, one of which calls the other.
 INNER = """
@@ -173,6 +174,47 @@ def test_without_private_parts_of_numba(package):
 def test_this_numba_was_tried():
     """If not: run the tests with it, then add it to the versions in jit.py."""
     assert re.match(r'\d+\.\d+', numba.__version__)[0] in TRIED
+
+
+# Calls two kernels, then compares what the engine says of symbols with what its modules list.
+SYMBOLS = """
+import json
+from numba.core.registry import cpu_target
+from rs_relpose_ros.pipeline import warm_up
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+log_so3(exp_so3(__import__('numpy').ones(3)))
+engine = cpu_target.target_context.codegen()._engine
+kept = vars(engine).get('kept_modules', [])
+symbols = [s for module in kept for s in (*module.functions, *module.global_variables)]
+inner = {s.name for s in symbols if s.linkage.name in ('internal', 'private')}
+defined = {s.name for s in symbols if not s.is_declaration} - inner
+declared = {s.name for s in symbols if s.is_declaration} - defined - engine._defined_symbols
+print(json.dumps([len(kept), len(defined), len(declared),
+                  all(map(engine.is_symbol_defined, defined)),
+                  any(map(engine.is_symbol_defined, [*declared, 'no such symbol']))]))
+"""
+
+
+def test_symbols_of_kernels_are_looked_up():
+    """As if they were listed; listed where the private parts of Numba are not used."""
+    kept, defined, declared, finds_all, finds_another = json.loads(output(SYMBOLS, cwd=ROOT))
+    assert kept > 2
+    assert defined > 10
+    assert declared > 10
+    assert finds_all
+    assert not finds_another
+    public = {**os.environ, 'RS_RELPOSE_PUBLIC_NUMBA': '1'}
+    assert json.loads(output(SYMBOLS, cwd=ROOT, env=public))[0] == 0
+
+
+def test_a_numba_without_the_engine_stays_as_it_is():
+    class Other:
+        is_symbol_defined = None
+
+    for engine in (Other, None):
+        look_up_symbols(engine)
+    assert vars(Other)['is_symbol_defined'] is None
+    assert not hasattr(Other, '_load_defined_symbols')
 
 
 def test_every_import_of_a_kernels_module_counts(monkeypatch):

@@ -15,6 +15,7 @@ from rs_relpose_ros.calibration import findings_text
 from rs_relpose_ros.calibration.findings import Assessment
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.garbage import collect_as_usual
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
 from rs_relpose_ros.messages.published_pair import PublishedPair
@@ -101,6 +102,7 @@ class OdometryNode(StoppableNode):
             )
         else:
             self._begin(self._settings.current)
+        collect_as_usual()
 
     def _on_parameters(self, parameters: Parameters) -> None:
         if self._begun:

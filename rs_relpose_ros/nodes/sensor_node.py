@@ -6,7 +6,6 @@ from abc import abstractmethod
 import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-import gc
 import logging
 import os
 from pathlib import Path
@@ -32,6 +31,7 @@ from rs_relpose_ros.calibrate.stored import Calibrated, Progress
 from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.garbage import collect_as_usual
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.messages.transforms import extrinsics
@@ -423,6 +423,7 @@ class SensorNode(StoppableNode):
         if not self._worker.warm.is_set():
             return
         self._warm_timer.cancel()
+        first = self._inputs is None
         if self._inputs is None:
             self._inputs = self._subscribe()
         else:
@@ -431,6 +432,8 @@ class SensorNode(StoppableNode):
         image, camera_info, imu, _ = self._inputs.topics.values()
         state = 'ready' if self._calibration is None else 'waiting for the first image'
         self.get_logger().info(f'{state}: {image}, {camera_info} and {imu}')
+        if first:
+            collect_as_usual()
 
     def _subscribe(self) -> SensorInputs:
         with ros_parameters.legal_qos():
@@ -438,9 +441,6 @@ class SensorNode(StoppableNode):
             inputs = SensorInputs(self, self._intake, transport, self._error)
         for warning in ros_parameters.unknown_qos_overrides(self):
             self._warn(warning)
-        # Objects that exist by now are permanent: the garbage collector need not scan them.
-        gc.collect()
-        gc.freeze()
         return inputs
 
     def stop(self) -> bool:

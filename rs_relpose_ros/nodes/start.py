@@ -15,6 +15,7 @@ import threading
 from typing import NoReturn
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
+from rs_relpose_ros.garbage import collect_seldom
 
 # Signals that end a node. [derived: ros2 launch sends the first, systems the second]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -28,6 +29,7 @@ def start(node: str) -> NoReturn:
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     threading.Thread(target=_wait_for_signal, name='signals', daemon=True).start()
     use_one_blas_thread()
+    collect_seldom()
     from rs_relpose_ros.nodes.sensor_node import leave
 
     run = importlib.import_module(f'rs_relpose_ros.nodes.{node}').main

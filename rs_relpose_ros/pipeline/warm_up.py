@@ -7,13 +7,13 @@ fills the cache on two cores in a minute: the first run then starts at once.
 
 from collections.abc import Iterator
 from dataclasses import replace
-import gc
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import cv2
 from llvmlite.binding import get_host_cpu_name
@@ -27,6 +27,7 @@ from rs_relpose_ros.estimator.estimate import estimate, Estimation
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import MODES
+from rs_relpose_ros.garbage import collect_seldom
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.gyro import GyroPath
@@ -155,11 +156,48 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     return points1, points2, camera, motion
 
 
+# -- Loading of kernels: symbols are looked up by name --------------------------------------------
+
+
+def look_up_symbols(engine: Any) -> None:
+    """Make `engine`, the class `JitEngine` of Numba, look symbols up instead of listing them.
+
+    A loaded kernel has a hundred symbols. Numba lists all of them, with three calls of LLVM for
+    each, and then asks for two or three: the list takes 0.15 s of the start of a node. The methods
+    that are replaced are private. A class without them stays as it is, with the same results.
+    """
+    if not (hasattr(engine, 'is_symbol_defined') and hasattr(engine, '_load_defined_symbols')):
+        return
+    is_listed = engine.is_symbol_defined
+
+    def keep(self: Any, module: Any) -> None:
+        vars(self).setdefault('kept_modules', []).append(module)
+
+    def is_defined(self: Any, name: str) -> bool:
+        # The newest first: Numba asks for what it has just added.
+        kept = reversed(vars(self).get('kept_modules', []))
+        return is_listed(self, name) or any(_defines(module, name) for module in kept)
+
+    engine._load_defined_symbols = keep
+    engine.is_symbol_defined = is_defined
+
+
+def _defines(module: Any, name: str) -> bool:
+    """Whether a module of LLVM defines a function or variable of this name for other modules."""
+    for get in (module.get_function, module.get_global_variable):
+        try:
+            if not get(name).is_declaration:
+                return True
+        except NameError:
+            continue
+    return False
+
+
+if not os.environ.get('RS_RELPOSE_PUBLIC_NUMBA'):
+    look_up_symbols(getattr(numba.core.codegen, 'JitEngine', None))
+
 # -- The cache of the kernels: other processes fill it, so that their memory is freed -------------
 
-# Garbage collections of Python while kernels compile: their syntax trees are no garbage, so that
-# looking for some costs a tenth of the time. [measured: compilation of all kernels]
-_GC_THRESHOLD = 100_000
 # A pipeline with this least number of inliers does everything but the estimate. [chosen: no pair
 # has so many matches]
 _UNREACHABLE = 10_000
@@ -173,7 +211,7 @@ _HALF = 'half'
 
 def fill_cache() -> None:
     """Compile the kernels of the default parameters, on two cores, one process each."""
-    gc.set_threshold(_GC_THRESHOLD)
+    collect_seldom()
     other_half = _started(_HALF)
     for solver in MODES[EstimatorConfig().solver].solvers:
         assert solver.address
@@ -195,7 +233,7 @@ def fill_cache() -> None:
 
 def _fill_half() -> None:
     """Compile a two-view estimate without sampling."""
-    gc.set_threshold(_GC_THRESHOLD)
+    collect_seldom()
     hypothesis = Solutions(np.eye(3)[None], np.eye(1, 9))
     Estimation(_problem()).refine(hypothesis)
 
