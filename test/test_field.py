@@ -219,20 +219,35 @@ def _path(base, seconds, sigma):
     )
 
 
-def test_a_path_is_aligned_with_the_truth_at_its_first_state(base):
+def test_a_path_is_aligned_with_the_truth_at_its_origin(base):
     path = _path(base, np.arange(0.2, 1.5, 0.1), 0.01)
-    np.testing.assert_allclose(truth.state_distances(base, path), 0.0, atol=1e-4)
+    origin = path.kept(slice(3, 4))
+    np.testing.assert_allclose(truth.state_distances(base, path, origin), 0.0, atol=1e-4)
     later = path._replace(positions=path.positions + np.linspace(0.0, 0.1, 13)[:, None])
-    distances = truth.state_distances(base, later)
+    distances = truth.state_distances(base, later, path.kept(slice(0, 1)))
     np.testing.assert_allclose(distances[-1], [300.0, 0.0], rtol=1e-3, atol=1e-4)
+
+
+def test_the_origin_of_a_live_path_is_found(base):
+    """Errors of the first published states do not move the others: they relate to the origin."""
+    path = _path(base, np.arange(0.1, 1.8, 0.1), 0.02)
+    rng = np.random.default_rng(3)
+    at_zero = path._replace(positions=path.positions - path.positions[1])
+    published = at_zero.kept(slice(5, None))
+    off = published.positions + 0.02 * rng.standard_normal(published.positions.shape)
+    noisy = published._replace(positions=off)
+    origin = truth.fitted_origin(base, noisy, path.stamps_ns.tolist())
+    assert origin.stamps_ns[0] == path.stamps_ns[1]
+    assert truth.state_distances(base, noisy, origin).mean() < 5.0
 
 
 def test_states_whose_stamp_is_of_two_times_are_not_compared(base):
     """Where both clocks are set back by half a second, stamps of half a second mean two times."""
     back = defects.wrapped_clock(base, 0.517, 1.0)
     path = _path(base, np.arange(0.05, 0.95, 0.1), 0.01)
-    assert len(truth.state_distances(base, path)) == 8
-    assert len(truth.state_distances(back, path)) == 3
+    origin = path.kept(slice(0, 1))
+    assert len(truth.state_distances(base, path, origin)) == 9
+    assert len(truth.state_distances(back, path, origin)) == 4
 
 
 def test_the_report_counts_verdicts(tmp_path, base, answered):

@@ -26,6 +26,7 @@ from rs_relpose_lab.live.processes import (
 )
 from rs_relpose_ros.calibration import findings_text
 from rs_relpose_ros.calibration.findings import Finding, FindingState
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes.inputs import message_class
@@ -51,9 +52,9 @@ class _Subscriptions:
             topic: graph.listen(message_class(PAIR_TOPICS[topic]), f'/{_FRONT_END}/{topic}')
             for topic in _COMPARED
         }
-        self.states = graph.listen(
-            message_class('nav_msgs/msg/Odometry'), f'/{_ODOMETRY}/odometry'
-        )
+        states = message_class('nav_msgs/msg/Odometry')
+        self.states = graph.listen(states, f'/{_ODOMETRY}/odometry')
+        self.keyframes = graph.listen(states, f'/{_ODOMETRY}/keyframes')
         diagnostics = message_class('diagnostic_msgs/msg/DiagnosticArray')
         self.diagnostics = graph.listen(diagnostics, '/diagnostics')
 
@@ -102,27 +103,38 @@ def _evidence(recording: FieldRecording, heard: _Subscriptions, logs: Sequence[s
     return Evidence(
         truth.pose_distances(recording, published_poses(references, complete)),
         len(heard.pairs['pairs']),
-        _state_distances(recording, heard.states),
+        _state_distances(recording, heard, list(references.values())),
         {},
         tuple(_causes(heard.diagnostics)),
         '\n'.join(complaints),
     )
 
 
-def _state_distances(recording: FieldRecording, messages: Sequence[Any]) -> Any:
-    """Squared distances (N, 2) of the published states, aligned with the truth at the first."""
-    if not messages:
+def _state_distances(
+    recording: FieldRecording, heard: _Subscriptions, references_ns: Sequence[int]
+) -> Array:
+    """Squared distances (N, 2) of the published states; their origin is a reference of a pair."""
+    if not (heard.states and heard.keyframes):
         return np.zeros((0, 2))
+    path = _path_of(heard.states)
+    # A keyframe has the stamp of its middle row, an image that of the row of its header.
+    keyframe = stamp_ns(heard.keyframes[0].header)
+    row_ns = keyframe - max(shot.stamp_ns for shot in recording.shots if shot.stamp_ns <= keyframe)
+    begins = {reference + row_ns for reference in references_ns}
+    origin = truth.fitted_origin(recording, path, begins)
+    return truth.state_distances(recording, path, origin)
+
+
+def _path_of(messages: Sequence[Any]) -> truth.Path:
     poses = [message.pose.pose for message in messages]
     places = [(pose.position.x, pose.position.y, pose.position.z) for pose in poses]
     turns = [pose.orientation for pose in poses]
-    path = truth.Path(
+    return truth.Path(
         np.array([stamp_ns(message.header) for message in messages], dtype=np.int64),
         np.array(places),
         Rotation.from_quat([(q.x, q.y, q.z, q.w) for q in turns]),
         np.array([message.pose.covariance for message in messages]).reshape(-1, 6, 6),
     )
-    return truth.state_distances(recording, path)
 
 
 def _causes(diagnostics: Iterable[Any]) -> list[NamedCause]:

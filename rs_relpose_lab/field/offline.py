@@ -168,7 +168,11 @@ def _state_distances(recording: FieldRecording, folder: Path) -> Array:
         _path_of([row for row in rows if row['path'] == number])
         for number in sorted({row['path'] for row in rows})
     ]
-    distances = [truth.state_distances(recording, part, smoothed) for part in parts]
+    distances = []
+    for part in parts:
+        first = part.kept(slice(0, 1))
+        origin = first if smoothed is None else truth.smoothed_origin(part, smoothed)
+        distances.append(truth.state_distances(recording, part, origin))
     return np.concatenate([np.zeros((0, 2)), *distances])
 
 

@@ -110,35 +110,36 @@ def calibration_sigmas(truth: dict[str, Any], found: dict[str, Any]) -> dict[str
 # Keyframes further apart [ns] belong to two paths. [chosen: the longest interval of keyframes is
 # 1 s; any value from there to the time of a loss would do]
 _OTHER_PATH_NS = 2_000_000_000
+# Length [ns] of the begin of a path whose states show where it began. Less leaves the scale
+# unknown, more brings drift into the choice. [chosen: keyframes are 0.1 s, 0.2 m, apart; 2 to 6 s
+# would do]
+_EARLY_NS = 4_000_000_000
 # Images further apart in truth [ns] are of different times that a clock has given one stamp.
 # [chosen: frames are 33 ms apart; 0.1 s to the least step back of a clock would do]
 _LONGEST_INTERVAL_NS = 200_000_000
 
 
-def state_distances(recording: FieldRecording, path: Path, smoothed: Path | None = None) -> Array:
+def state_distances(recording: FieldRecording, path: Path, origin: Path) -> Array:
     """Squared Mahalanobis distances (N, 2) of position and rotation of the states of a path.
 
-    Its world has the origin in the first keyframe of its part of `smoothed`, which all states
-    relate to; the path is aligned there with the truth, in position and heading. Without
-    `smoothed`, or before its first keyframe, it is aligned at its own first state.
+    All states relate to `origin`, one state of the path's world, which is aligned there with the
+    truth, in position and heading. States whose stamps have no single true time are left out.
     """
-    inside = _has_truth(recording, path.stamps_ns)
-    if inside.sum() < 2:
+    own = path.kept(_has_truth(recording, path.stamps_ns))
+    if len(own.stamps_ns) == 0:
         return np.zeros((0, 2))
-    own = path.kept(inside)
-    origin = _origin(path, own, smoothed)
     at_origin = recording.states(_true_ns(recording, origin.stamps_ns))
-    R_origin = at_origin.R_world_cam[0] @ recording.R_camera_image
-    turn = origin.rotations.as_matrix()[0] @ R_origin.T
-    heading = Rotation.from_euler('z', np.arctan2(turn[1, 0], turn[0, 0])).as_matrix()
+    R_origin = _true_rotations(recording, origin.stamps_ns)
+    turn = (origin.rotations * R_origin.inv()).as_matrix()[0]
+    heading = Rotation.from_euler('z', np.arctan2(turn[1, 0], turn[0, 0]))
 
     states = recording.states(_true_ns(recording, own.stamps_ns))
-    R_true = Rotation.from_matrix(heading @ states.R_world_cam @ recording.R_camera_image)
-    moved = (states.position - at_origin.position[0]) @ heading.T
+    R_true = heading * _true_rotations(recording, own.stamps_ns)
+    moved = heading.apply(states.position - at_origin.position[0])
     error_p = origin.positions[0] + moved - own.positions
     error_R = (R_true * own.rotations.inv()).as_rotvec()
     spreads_p, spreads_R = own.covariances[:, :3, :3], own.covariances[:, 3:, 3:]
-    squares = [_squares(error_p[1:], spreads_p[1:]), _squares(error_R[1:], spreads_R[1:])]
+    squares = [_squares(error_p, spreads_p), _squares(error_R, spreads_R)]
     return np.stack(squares, axis=1)
 
 
@@ -149,17 +150,40 @@ def _squares(errors: Array, covariances: Array) -> Array:
     return squares
 
 
-def _origin(path: Path, own: Path, smoothed: Path | None) -> Path:
-    """The state that a path is aligned at: `own` are its states with a truth."""
-    if smoothed is not None:
-        before = np.flatnonzero(smoothed.stamps_ns <= path.stamps_ns[0])
-        if len(before):
-            begin = int(before[np.argmax(smoothed.stamps_ns[before])])
-            steps = np.diff(smoothed.stamps_ns)  # negative where the clock was set back
-            while begin and 0 <= steps[begin - 1] <= _OTHER_PATH_NS:
-                begin -= 1
-            return smoothed.kept(slice(begin, begin + 1))
-    return own.kept(slice(0, 1))
+def smoothed_origin(path: Path, smoothed: Path) -> Path:
+    """The first keyframe of the part of the smoothed path that a path belongs to."""
+    before = np.flatnonzero(smoothed.stamps_ns <= path.stamps_ns[0])
+    if len(before) == 0:
+        return path.kept(slice(0, 1))
+    begin = int(before[np.argmax(smoothed.stamps_ns[before])])
+    steps = np.diff(smoothed.stamps_ns)  # negative where the clock was set back
+    while begin and 0 <= steps[begin - 1] <= _OTHER_PATH_NS:
+        begin -= 1
+    return smoothed.kept(slice(begin, begin + 1))
+
+
+def fitted_origin(recording: FieldRecording, path: Path, stamps_ns: Iterable[int]) -> Path:
+    """The origin of a path of unknown begin: that of the stamps which fits its first states best.
+
+    A path begins at position 0 with the keyframe that its first state, seconds later, relates to.
+    """
+    first = path.kept(slice(0, 1))
+    early = path.kept(path.stamps_ns <= first.stamps_ns[0] + _EARLY_NS)
+    turn = (early.rotations * _true_rotations(recording, early.stamps_ns).inv()).mean()
+    begins = [one for one in sorted(stamps_ns) if one <= first.stamps_ns[0]]
+    origins = [first]
+    for begin in begins:
+        stamp = np.array([begin], dtype=np.int64)
+        rotation = turn * _true_rotations(recording, stamp)
+        origins.append(Path(stamp, np.zeros((1, 3)), rotation, np.zeros((1, 6, 6))))
+    candidates = origins[1:] or origins
+    return min(candidates, key=lambda one: float(state_distances(recording, early, one).sum()))
+
+
+def _true_rotations(recording: FieldRecording, stamps_ns: Stamps) -> Rotation:
+    """True rotations from the published images' axes to the world."""
+    states = recording.states(_true_ns(recording, stamps_ns))
+    return Rotation.from_matrix(states.R_world_cam @ recording.R_camera_image)
 
 
 def _stamps_and_true(recording: FieldRecording) -> tuple[Stamps, Stamps]:
