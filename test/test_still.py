@@ -1,5 +1,7 @@
 """Repeated images and static parts of images: compared with a rotation of the camera."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -186,6 +188,21 @@ def test_repeated_images_are_reported_and_not_used(recording, tmp_path):
     stamps = {shot.stamp_ns for shot in recording.shots[2::3]}
     assert pairs
     assert sum(pair.stamp_ns in stamps for pair in pairs) <= 1  # where the camera hardly turned
+
+
+def test_the_copy_of_a_lost_image_is_not_used(recording, tmp_path):
+    """A busy machine drops images, after which their copies look new."""
+    repeated = defects.repeated_images(recording, 3, 0.8)
+    copies = {shot.stamp_ns for shot in recording.shots[2::3]}
+    # The original of every third copy is lost, once three copies are known.
+    lost = {shot.stamp_ns for shot in recording.shots[13::9]}
+    kept = tuple(shot for shot in repeated.shots if shot.stamp_ns not in lost)
+    health, pairs = replayed(replace(repeated, shots=kept), tmp_path)
+    assert Code.REPEATED_IMAGES in {finding.code for finding in health.findings}
+    assert len(pairs) >= 4
+    late = [pair for pair in pairs if pair.stamp_ns > recording.shots[12].stamp_ns]
+    assert late
+    assert not any(pair.stamp_ns in copies for pair in late)
 
 
 def test_an_intact_walk_has_neither_finding(recording, tmp_path):

@@ -220,6 +220,13 @@ CASES: tuple[Case, ...] = (
         solvable=True,
     ),
     Case(
+        'C12-lost',
+        'every third image is the one before, and a sixth of all do not arrive',
+        lambda one: _D.lost_images(_D.repeated_images(one, every=3, noise=0.8), share=1 / 6),
+        r'repeat|same image|duplicate|frozen',
+        ('repeated_images',),
+    ),
+    Case(
         'C12-frozen',
         'the image is frozen for 1 s',
         partial(_D.frozen_images, begin=11.0, seconds=1.0),

@@ -148,6 +148,15 @@ def repeated_images(recording: FieldRecording, every: int, noise: float) -> Fiel
     return replace(recording, shots=tuple(shots))
 
 
+def lost_images(recording: FieldRecording, share: float) -> FieldRecording:
+    """A share of the images does not arrive, as of a busy machine."""
+    rng = np.random.default_rng(19)
+    arrives = rng.random(len(recording.shots)) >= share
+    arrives[0] = True
+    shots = tuple(shot for shot, kept in zip(recording.shots, arrives, strict=True) if kept)
+    return replace(recording, shots=shots)
+
+
 def frozen_images(recording: FieldRecording, begin: float, seconds: float) -> FieldRecording:
     """The driver sends the same image for `seconds`."""
     times = recording.seconds(np.array([shot.stamp_ns for shot in recording.shots]))

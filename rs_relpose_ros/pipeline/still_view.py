@@ -7,7 +7,7 @@ gyro of the images that are skipped.
 from collections import deque
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,24 @@ _COUNTED = 600
 # Least number of repeated images that is reported: one or two are no habit of a driver.
 # [chosen: 3 to 10 would do]
 _REPORTED = 3
+# Number of the last stamps that show the interval of the camera. Fewer may all be after lost
+# images, more follow a new rate later. [chosen: a second at 30 Hz]
+_STAMPS = 32
+# Quantile of the intervals of stamps that contains no lost image. A larger one fails where fewer
+# images are lost, a smaller one takes the jitter of stamps for the rate. [derived: less than three
+# of four intervals contain a lost image]
+_WHOLE = 0.25
+# An interval that is longer than the camera's by this factor contains a lost image. A smaller one
+# takes jitter for a loss, a larger one does not find the loss of one image. [derived: halfway
+# between one and two intervals]
+_LOST = 1.5
+
+
+class _Doubtful(NamedTuple):
+    """An image that may repeat a lost one, and that later ones are compared with."""
+
+    imu: FrameImu
+    passed: ImuSlice | None  # gyro from it to the last image; None: it is the last one
 
 
 class StillView:
@@ -41,31 +59,57 @@ class StillView:
         self._size = (0, 0)  # (H, W) of the images
         self._parts = StillParts()
         self._skipped: ImuSlice | None = None  # from the last new image to the last image
+        self._stamps_ns: deque[int] = deque(maxlen=_STAMPS)  # of the last images
+        self._doubtful: _Doubtful | None = None  # since the last new image
 
     def start(self, stamp_ns: int, image: Image) -> None:
         """Begin with an image, which is new by definition."""
         self._parts.reset()
         self._parts.add(stamp_ns, image, np.zeros(()))
         self._skipped = None
+        self._doubtful = None
+        self._stamps_ns.clear()
+        self._stamps_ns.append(stamp_ns)
         self._size = image.shape
 
     def imu_of_new(
         self, stamp_ns: int, image: Image, imu: FrameImu, previous: FrameImu, sensor: Sensor
     ) -> FrameImu | None:
-        """IMU data since the last new image, `previous`; None if this image is not new."""
+        """IMU data since the last new image, `previous`; None if this image is not new.
+
+        An image after a lost one may repeat that one, which nobody can compare it with: where a
+        driver is known to repeat images it is not used, and the next one is compared with it.
+        """
         since = imu.since_previous
         assert since is not None
-        if self._skipped is not None:
-            since = self._skipped.joined(since)
-        imu = replace(imu, since_previous=since)
-        repeated = self._parts.add(stamp_ns, image, _motion_of_cells(previous, imu, sensor))
+        since_new = _joined(self._skipped, since)
+        compared, since_compared = previous, since_new
+        if self._doubtful is not None:
+            compared, since_compared = self._doubtful.imu, _joined(self._doubtful.passed, since)
+        step = replace(imu, since_previous=since_compared)
+        repeated = self._parts.add(stamp_ns, image, _motion_of_cells(compared, step, sensor))
         self.static = self._parts.static()
         self._repeated.append(repeated)
-        if repeated:
-            self._skipped = since
-            return None
-        self._skipped = None
-        return imu
+        self._stamps_ns.append(stamp_ns)
+        may_repeat = self._repeats() and self._follows_a_loss()
+        if not repeated and not may_repeat:
+            self._skipped = self._doubtful = None
+            return replace(imu, since_previous=since_new)
+        self._skipped = since_new
+        if not repeated:
+            self._doubtful = _Doubtful(imu, None)
+        elif self._doubtful is not None:
+            self._doubtful = self._doubtful._replace(passed=since_compared)
+        return None
+
+    def _repeats(self) -> bool:
+        """Whether the driver is known to repeat images."""
+        return sum(self._repeated) >= _REPORTED
+
+    def _follows_a_loss(self) -> bool:
+        """Whether images before the last one are missing, by the interval of the camera."""
+        intervals = np.diff(np.array(self._stamps_ns))
+        return bool(intervals[-1] > _LOST * np.quantile(intervals, _WHOLE))
 
     def allowed(self) -> Image | None:
         """Mask (H, W) of the image that is 0 in static parts; None where nothing is static."""
@@ -75,9 +119,8 @@ class StillView:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on repeated images and on static parts."""
         found = []
-        repeated = sum(self._repeated)
-        if repeated >= _REPORTED:
-            measured = {'repeated': repeated, 'images': len(self._repeated)}
+        if self._repeats():
+            measured = {'repeated': sum(self._repeated), 'images': len(self._repeated)}
             found.append(_still(Code.REPEATED_IMAGES, measured))
         if self.static.any():
             found.append(_still(Code.STATIC_REGION, self._extent()))
@@ -91,6 +134,10 @@ class StillView:
             'rows': _range(np.any(self.static, axis=1), height),
             'columns': _range(np.any(self.static, axis=0), width),
         }
+
+
+def _joined(earlier: ImuSlice | None, later: ImuSlice) -> ImuSlice:
+    return later if earlier is None else earlier.joined(later)
 
 
 def _range(are_static: Flags, size: int) -> list[int]:
