@@ -38,7 +38,7 @@ BANNED = re.compile(r'\b(?:told|figures?|seen|judged|anew|sentences?)\b', re.IGN
 # What users have in scripts keeps its words: JSON keys, a status, an option; a library's class.
 INTERFACE = re.compile(
     r"""['"`](?:told|seen|figures?|sentence)['"`]|['"`]told\ wrong['"`]|--figures\b
-    |matplotlib\.figure|\bFigure\b(?=$|[(:,)])""",
+    |matplotlib\.figure|\bFigure\b(?=$|[(:,)\]])""",
     re.VERBOSE,
 )
 PROSE = (*sorted((ROOT / 'docs').rglob('*.md')), ROOT / 'README.md')

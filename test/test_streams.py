@@ -376,8 +376,8 @@ def test_units_of_counters():
 def test_multiplied_values_have_their_factor():
     rng = np.random.default_rng(3)
     turning = np.sin(np.arange(500)[:, None] * 0.05 + np.arange(3)) + rng.normal(0, 2e-3, (500, 3))
-    assert find_multiplied(turning) is None
-    assert find_multiplied(np.round(turning[:60] * 0.01, 2)) is None  # coarse, nearly at rest
+    assert find_multiplied(turning) == (1.0, '')
+    assert find_multiplied(np.round(turning[:60] * 0.01, 2)) == (1.0, '')  # coarse, nearly at rest
     held = np.repeat(turning, 4, axis=0)
     factor, how = find_multiplied(held)
     assert how == 'repeated' and factor == pytest.approx(4.0, rel=0.02)

@@ -19,9 +19,8 @@ from rs_relpose_ros.bags.sensor_topics import CAMERA_INFO, COMPRESSED_IMAGE, IMA
 from rs_relpose_ros.bags.storage import Entry, StoredTopic
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
-# Types of the sensors whose clocks decide the order of reading. [derived: `reading_times`]
+# Types of images. [derived: interface of ROS]
 _IMAGES = (IMAGE, COMPRESSED_IMAGE)
-_MEASURED = (*_IMAGES, IMU)  # images and IMU; CameraInfo has no clock of its own
 # Smallest offset of the clocks [s] that changes the order of reading: within less the history of
 # the IMU has the samples of an image anyhow. [chosen: below its 5 s, above delays of drivers]
 _LEAST_OFFSET = 1.0
@@ -92,16 +91,17 @@ def times_by_stamp(
 
     `time_offset` [s]: the clock of the IMU less that of the camera.
     """
-    of_type = numbers.items()
-    sensors = [number for (_, msgtype), number in of_type if msgtype in _MEASURED]
-    of_info = [number for (_, msgtype), number in of_type if msgtype == CAMERA_INFO]
-    of_camera = [n for (_, msgtype), n in of_type if msgtype in (*_IMAGES, CAMERA_INFO)]
+
+    def of_types(*types: str) -> list[int]:
+        """Numbers of the topics of some types."""
+        return [number for (_, msgtype), number in numbers.items() if msgtype in types]
+
     stamps = index.stamp
     if abs(time_offset) > _LEAST_OFFSET:
-        shift_ns = to_nanoseconds(time_offset)
-        stamps = stamps + shift_ns * np.isin(index.topic, of_camera)
-    times = reading_times(stamps, index.topic, sensors)
-    infos = np.flatnonzero(np.isin(index.topic, of_info))
+        of_camera = np.isin(index.topic, of_types(*_IMAGES, CAMERA_INFO))
+        stamps = stamps + to_nanoseconds(time_offset) * of_camera
+    times = reading_times(stamps, index.topic, of_types(*_IMAGES, IMU))
+    infos = np.flatnonzero(np.isin(index.topic, of_types(CAMERA_INFO)))
     if len(infos):
         # It serves the images before it, too: drivers publish it late, or once.
         earliest = infos[np.argmin(times[infos])]

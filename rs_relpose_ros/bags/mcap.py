@@ -52,18 +52,23 @@ _MESSAGE_HEAD = struct.Struct('<HIQQ')
 # A chunk begins with two times, size, checksum, and length of the compression's name. [derived:
 # MCAP]
 _CHUNK_HEAD = struct.Struct('<QQQII')
-# Statistics begin with six counts, and the first and the last time. [derived: MCAP]
-_STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
+# Bytes that statistics begin with: six counts, and the first and the last time. [derived: MCAP]
+_STATISTICS_HEAD_BYTES = struct.calcsize('<QHIIIIQQ')
 # Statistics go on with pairs of a channel and the number of its messages. [derived: MCAP]
 _COUNT = struct.Struct('<HQ')
 # The end of a file has a head, starts of summary and offsets, checksum, and magic. [derived: MCAP]
 _END = struct.Struct('<BQQQI8s')
+# Bytes of the footer between its head and the magic: two places and a checksum. [derived: MCAP]
+_FOOTER_BYTES = struct.calcsize('<QQI')
 # A text begins with its length. [derived: MCAP]
 _LENGTH = struct.Struct('<I')
 # The data of a chunk begin with their size. [derived: MCAP]
 _SIZE = struct.Struct('<Q')
 # Name of no compression; an empty name means the same. [derived: MCAP]
 _PLAIN = b'none'
+# Bytes of the record of a message that an index needs: its head, and what its stamp is in.
+# [derived: `BEGIN_BYTES`]
+_MOST_OF_BEGIN = _MESSAGE_HEAD.size + BEGIN_BYTES
 # Bytes that are read at once where only the begins of messages are needed. Less takes more calls
 # for small messages, more reads the pixels of images, too. [chosen: 4 to 64 kB would do]
 _BLOCK_BYTES = 1 << 14
@@ -89,11 +94,11 @@ class McapStorage:
         self._schemas: dict[int, tuple[str, bytes]] = {}
         self._channels: dict[int, _Channel] = {}
         self._counts: Counter[int] = Counter()
-        self.start_ns = self.end_ns = 0
         footer, summary = self._find_end()
         self._end = summary or footer
         if not (summary and self._read_summary(summary, footer)):
-            self._count_messages()
+            # Topics and counts are in the data alone.
+            self._counts = Counter(entry.topic_id for entry in self.entries())
         self.topics = [self._topic(number) for number in self._channels]
 
     def entries(self) -> Iterator[Entry]:
@@ -102,7 +107,7 @@ class McapStorage:
             if kind == _CHUNK:
                 yield from self._entries_of(start, size)
             elif kind == _MESSAGE:
-                begin = self._read(start, min(size, _MESSAGE_HEAD.size + BEGIN_BYTES))
+                begin = self._read(start, min(size, _MOST_OF_BEGIN))
                 whole = functools.partial(self._read, start, size)
                 yield self._entry(begin, whole, start, -1)
             elif kind in (_SCHEMA, _CHANNEL):
@@ -123,20 +128,24 @@ class McapStorage:
         window = _Window(self._file, *plain) if plain else _Window.of(self._chunks[place])
         for kind, offset, length in window.records():
             if kind == _MESSAGE:
-                begin = window.bytes(offset, min(length, _MESSAGE_HEAD.size + BEGIN_BYTES))
+                begin = window.bytes(offset, min(length, _MOST_OF_BEGIN))
                 whole = functools.partial(window.bytes, offset, length)
                 yield self._entry(begin, whole, place, offset)
             elif kind in (_SCHEMA, _CHANNEL):
-                self._describe(kind, bytes(window.bytes(offset, length)))
+                record = window.bytes(offset, length)
+                self._describe(kind, bytes(record))
 
     def _plain_records(self, place: int, size: int) -> tuple[int, int] | None:
         """Place and size of the records of a chunk that is not compressed; None of another."""
-        head = self._read(place, min(size, _CHUNK_HEAD.size + len(_PLAIN) + _SIZE.size))
+        longest = _CHUNK_HEAD.size + len(_PLAIN) + _SIZE.size
+        head = self._read(place, min(size, longest))
         _, _, content, _, length = _CHUNK_HEAD.unpack_from(head)
-        if length > len(_PLAIN) or head[_CHUNK_HEAD.size :][:length] not in (b'', _PLAIN):
+        end_of_name = _CHUNK_HEAD.size + length
+        name = head[_CHUNK_HEAD.size : end_of_name]
+        if length > len(_PLAIN) or name not in (b'', _PLAIN):
             return None
-        (stored,) = _SIZE.unpack_from(head, _CHUNK_HEAD.size + length)
-        start = _CHUNK_HEAD.size + length + _SIZE.size
+        (stored,) = _SIZE.unpack_from(head, end_of_name)
+        start = end_of_name + _SIZE.size
         if stored != content or stored > size - start:
             raise DamagedError('a chunk is not as large as its head says')
         return place + start, stored
@@ -167,8 +176,8 @@ class McapStorage:
         footer = max(file_size - _END.size, len(magic))
         end = self._read(footer, _END.size)
         kind, size, summary, _, _, last_bytes = _END.unpack(end)
-        expected = _FOOTER, _END.size - _HEAD.size - len(magic), magic
-        if (kind, size, last_bytes) != expected or summary > footer:
+        found = kind, size, last_bytes
+        if found != (_FOOTER, _FOOTER_BYTES, magic) or summary > footer:
             raise DamagedError('it has no end')
         return footer, summary
 
@@ -184,20 +193,8 @@ class McapStorage:
         return has_statistics and bool(self._channels or not self._counts)
 
     def _use_statistics(self, record: bytes) -> None:
-        *_, self.start_ns, self.end_ns = _STATISTICS_HEAD.unpack_from(record)
-        counts = _Fields(record, _STATISTICS_HEAD.size).bytes()
+        counts = _Fields(record, _STATISTICS_HEAD_BYTES).bytes()
         self._counts = Counter(dict(_COUNT.iter_unpack(counts)))
-
-    def _count_messages(self) -> None:
-        """Read topics and counts from the data."""
-        self._counts.clear()
-        first = last = None
-        for entry in self.entries():
-            self._counts[entry.topic_id] += 1
-            first = entry.time_ns if first is None else min(first, entry.time_ns)
-            last = entry.time_ns if last is None else max(last, entry.time_ns)
-        self.start_ns = first or 0
-        self.end_ns = last or 0
 
     def _describe(self, kind: int, record: bytes) -> None:
         """Keep a schema or a channel."""
@@ -272,8 +269,10 @@ class _Window:
     def bytes(self, place: int, count: int) -> bytes | memoryview:
         """Bytes at a place after the start."""
         at = place - self._begin
-        if self._file is not None and not (0 <= at and at + count <= len(self._block)):
-            largest = max(count, min(_BLOCK_BYTES, self._size - place))
+        is_in_block = 0 <= at and at + count <= len(self._block)
+        if self._file is not None and not is_in_block:
+            left = self._size - place
+            largest = max(count, min(_BLOCK_BYTES, left))
             self._block = read_exactly(self._file, self._start + place, largest)
             self._begin = place
             at = 0
@@ -327,7 +326,8 @@ def intact_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             yield kind, record
         elif kind == _CHUNK:
             with suppress(Exception):  # damaged bytes can raise anything in the decompressors
-                for _ in _Window.of(chunk_content(record)).records():
+                content = _Window.of(chunk_content(record))
+                for _ in content.records():
                     pass
                 yield kind, record
 
@@ -338,8 +338,7 @@ def write_records(file: BinaryIO, records: Iterable[tuple[int, bytes]]) -> None:
     file.write(magic)
     for kind, record in records:
         file.write(_HEAD.pack(kind, len(record)) + record)
-    size = _END.size - _HEAD.size - len(magic)
-    file.write(_END.pack(_FOOTER, size, 0, 0, 0, magic))
+    file.write(_END.pack(_FOOTER, _FOOTER_BYTES, 0, 0, 0, magic))
 
 
 class _Fields:

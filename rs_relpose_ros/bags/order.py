@@ -35,10 +35,12 @@ def clock_runs(stamps: Times) -> NDArray[np.int64]:
     runs = np.zeros(len(stamps), dtype=np.int64)
     if len(stamps) < 2 * _FEWEST_AFTER_RESET:
         return runs
-    period = max(float(np.median(np.diff(np.sort(stamps)))), 1.0)
+    steps = np.diff(np.sort(stamps))
+    period = max(float(np.median(steps)), 1.0)
     begin = 0  # of the run
     largest = np.maximum.accumulate(stamps)
-    for step in np.flatnonzero(np.diff(stamps) < 0) + 1:
+    backward = np.flatnonzero(np.diff(stamps) < 0) + 1
+    for step in backward:
         top = largest[step - 1]
         if _is_reset(stamps[begin:step], stamps[step:], top, period):
             begin = int(step)
@@ -52,7 +54,8 @@ def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
 
     `before` and `after` the step (N,) and (M,) [ns]; `top` is the largest stamp before it.
     """
-    if len(after) < _FEWEST_AFTER_RESET or np.any(after[:_FEWEST_AFTER_RESET] > top):
+    first = after[:_FEWEST_AFTER_RESET]
+    if len(first) < _FEWEST_AFTER_RESET or np.any(first > top):
         return False
     start = int(after[0])
     passing = np.flatnonzero(after > top)
@@ -80,18 +83,21 @@ def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[in
     by_topic = {int(topic): np.flatnonzero(topics == topic) for topic in np.unique(topics)}
     for rows in by_topic.values():
         runs[rows] = clock_runs(stamps[rows])
-    resets = {int(runs[by_topic[topic][-1]]) for topic in sensors if topic in by_topic}
+    last_rows = [by_topic[topic][-1] for topic in sensors if topic in by_topic]
+    resets = {int(run) for run in runs[last_rows]}
     if len(resets) == 1:
         # All clocks were set back equally often, mostly never: one run is read after the other.
         of_sensors = np.isin(topics, list(sensors))
         for run in range(1, resets.pop() + 1):
+            before = runs == run - 1
             here = runs == run
-            end = times[of_sensors & (runs == run - 1)].max()
+            end = times[of_sensors & before].max()
             begin = times[of_sensors & here].min()
             times[here] += end + _BETWEEN_RUNS_NS - begin
     else:
         # A sensor alone was set back: its messages keep the order of the file.
         for rows in by_topic.values():
-            if runs[rows[-1]]:
+            was_set_back = runs[rows[-1]] > 0
+            if was_set_back:
                 times[rows] = np.maximum.accumulate(times[rows])
     return times

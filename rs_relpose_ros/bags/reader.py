@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import QosReliability
 
 from rs_relpose_ros.bags.decoding import as_cdr, known_types, read_cdr
@@ -27,6 +26,7 @@ from rs_relpose_ros.bags.sensor_topics import (
 from rs_relpose_ros.bags.storage import message_data, StoredTopic
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.messages.streams import Timeline
 
 # Rows of the index that become Python's numbers at once. Less is slower, all would take 1 GB of a
 # bag of some million messages. [chosen: 1000 to 100 000 would do]
@@ -55,13 +55,6 @@ class RawMessage(NamedTuple):
     read_ns: int = 0
 
 
-class Timeline(NamedTuple):
-    """Times of the messages of a topic in the order of the file [ns]."""
-
-    stamps: NDArray[np.int64]
-    received: NDArray[np.int64]
-
-
 class Bag:
     """An open bag; made by `open_bag`."""
 
@@ -76,24 +69,30 @@ class Bag:
         self._stored: dict[tuple[str, str], StoredTopic] = {}
         for opened in self._storages:
             for topic in opened.topics:
-                key = topic.name, topic.msgtype
-                if not ''.join(key).isprintable():
-                    raise InputError(f'{path} is damaged: a topic has no printable name or type')
-                digest = topic.digest or metadata.digests.get(key, '')
-                found = topic._replace(digest=digest, messages=0)
-                whole = self._stored.setdefault(key, found)
-                count = whole.messages + topic.messages
-                self._stored[key] = whole._replace(messages=count)
+                self._add_topic(topic, metadata.digests)
         self._numbers = {key: number for number, key in enumerate(self._stored)}
         stored = [one for _, one in sorted(self._stored.items())]
         self.topics = tuple(Topic(one.name, one.msgtype, one.messages) for one in stored)
-        # Time from the first to the last message [s].
-        self.duration = 0.0
-        filled = [s for s in self._storages if any(topic.messages for topic in s.topics)]
-        if filled:
-            first_ns = min(opened.start_ns for opened in filled)
-            last_ns = max(opened.end_ns for opened in filled)
-            self.duration = (last_ns + 1 - first_ns) / NANOSECONDS
+
+    def _add_topic(self, topic: StoredTopic, digests: Mapping[tuple[str, str], str]) -> None:
+        """Add a topic of one file, with its hash of `digests` where the file has none."""
+        key = topic.name, topic.msgtype
+        if not ''.join(key).isprintable():
+            raise InputError(f'{self.path} is damaged: a topic has no printable name or type')
+        count = topic.messages
+        if key in self._stored:
+            self._stored[key] = self._stored[key]._replace(
+                messages=self._stored[key].messages + count
+            )
+            return
+        digest = topic.digest or digests.get(key, '')
+        self._stored[key] = topic._replace(digest=digest)
+
+    @property
+    def duration(self) -> float:
+        """Time of recording from the first to the last message [s]."""
+        received = self._whole_index.received
+        return int(np.ptp(received)) / NANOSECONDS if len(received) else 0.0
 
     def reliability(self, topic: Topic) -> str:
         """``'reliable'`` or ``'best effort'`` as its publishers offered; empty if not recorded."""
@@ -169,11 +168,13 @@ class Bag:
         stored = list(self._stored.values())
         # Equal times are read in the order of the topics' names, whatever the file has first.
         names = [topic.name for topic in stored]
-        rank = np.argsort(np.argsort(names))
+        by_name = np.argsort(names)
+        rank = np.argsort(by_name)
         order = np.lexsort((rank[index.topic], times))
+        columns = (index.topic, index.file, index.place, index.offset, index.received, times)
         for first in range(0, len(order), _ROWS):
             rows = order[first : first + _ROWS]
-            chosen = (column[rows].tolist() for column in (*index[:5], times))
+            chosen = [column[rows].tolist() for column in columns]
             for number, file, place, offset, received_ns, read_ns in zip(*chosen, strict=True):
                 topic = stored[number]
                 cdr = as_cdr(self.path, topic, self._data(file, place, offset))
@@ -181,9 +182,9 @@ class Bag:
                 yield RawMessage(topic.name, topic.msgtype, received_ns, cdr, read_ns)
 
     def timeline(self, topic: Topic) -> Timeline:
-        """Stamps and times of reception of a topic."""
+        """Stamps and times of reception of a topic, in the order of the file."""
         index = self._index([topic])
-        return Timeline(index.stamp, index.received)
+        return Timeline(topic.name, index.stamp, index.received)
 
     def read(self, raw: RawMessage) -> Any:
         """The ROS 2 message of an item of `raw_messages`; InputError if it cannot be decoded."""

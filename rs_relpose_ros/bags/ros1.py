@@ -75,7 +75,7 @@ class Ros1Storage:
         self._places: list[int] = []
         self._counts: Counter[int] = Counter()
         self.topics: list[StoredTopic] = []
-        self.start_ns = self.end_ns = 0
+
         if self._read(0, len(_MAGIC)) != _MAGIC:
             raise DamagedError('only version 2.0 of ROS 1 bags can be read')
         fields, _, _ = self._record(len(_MAGIC))
@@ -87,8 +87,9 @@ class Ros1Storage:
                 f'its recorder has not closed it: "rosbag reindex {path.name}" in ROS 1 does'
             )
         self._read_index(index, size)
-        counted = _LENGTH.unpack(fields['conn_count']), _LENGTH.unpack(fields['chunk_count'])
-        if counted != ((len(self.topics),), (len(self._places),)):
+        (connections,) = _LENGTH.unpack(fields['conn_count'])
+        (chunks,) = _LENGTH.unpack(fields['chunk_count'])
+        if connections != len(self.topics) or chunks != len(self._places):
             raise DamagedError('its index is not complete')
 
     def entries(self) -> Iterator[Entry]:
@@ -121,30 +122,29 @@ class Ros1Storage:
         (length,) = _LENGTH.unpack(self._read(start, _LENGTH.size))
         if length > _MAX_HEADER:
             raise DamagedError('a header has no end')
-        header = self._read(start + _LENGTH.size, length + _LENGTH.size)
+        start += _LENGTH.size
+        header = self._read(start, length + _LENGTH.size)
         (size,) = _LENGTH.unpack_from(header, length)
-        return _fields(header[:length]), start + length + 2 * _LENGTH.size, size
+        return _fields(header[:length]), start + len(header), size
 
     def _read_index(self, start: int, end: int) -> None:
         """Read the connections and the places of the chunks, which stand at the end."""
         connections: dict[int, dict[str, bytes]] = {}
-        times: list[int] = []
         while start < end:
             fields, data, size = self._record(start)
             start = data + size
             kind = fields['op'][0]
             if kind == _CONNECTION:
                 (number,) = _LENGTH.unpack(fields['conn'])
+                connections[number] = _fields(self._read(data, size))
                 # Header and data both name the topic. The header has it as it was recorded.
-                connections[number] = {**_fields(self._read(data, size)), 'topic': fields['topic']}
+                connections[number]['topic'] = fields['topic']
             elif kind == _CHUNK_INFO:
                 self._places += _PLACE.unpack(fields['chunk_pos'])
-                for connection, count in _COUNT.iter_unpack(self._read(data, size)):
+                counts = self._read(data, size)
+                for connection, count in _COUNT.iter_unpack(counts):
                     self._counts[connection] += count
-                times += [_nanoseconds(fields['start_time']), _nanoseconds(fields['end_time'])]
         self._places.sort()
-        self.start_ns = min(times, default=0)
-        self.end_ns = max(times, default=0)
         self.topics = [self._topic(*connection) for connection in connections.items()]
 
     def _topic(self, number: int, connection: dict[str, bytes]) -> StoredTopic:

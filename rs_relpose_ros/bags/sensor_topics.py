@@ -87,6 +87,13 @@ class Chosen(NamedTuple):
     imu: Topic | None
     accel: Topic | None
 
+    @property
+    def sensors(self) -> SensorTopics | None:
+        """The topics of camera and IMU; None if the images or the gyro are absent."""
+        if self.image is None or self.imu is None:
+            return None
+        return SensorTopics(self.image, self.camera_info, self.imu, self.accel, None)
+
 
 @dataclass(frozen=True, slots=True)
 class TopicFinder:

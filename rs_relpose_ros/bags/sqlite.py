@@ -101,5 +101,3 @@ class SqliteStorage:
                 qos_profiles(str(found.get('offered_qos_profiles') or '')),
             )
             self.topics.append(topic)
-        times = query('SELECT min(timestamp), max(timestamp) FROM messages').fetchone()
-        self.start_ns, self.end_ns = (int(time or 0) for time in times)

@@ -96,8 +96,6 @@ class Storage(Protocol):
     """
 
     topics: list[StoredTopic]
-    start_ns: int  # first and last time of recording; both 0 without messages
-    end_ns: int
 
     def entries(self) -> Iterator[Entry]:
         """All messages in the order of the file."""

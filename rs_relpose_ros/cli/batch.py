@@ -248,25 +248,28 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
 
 
 def _bag_at(path: Path) -> Bag:
-    files = path.iterdir() if path.is_dir() else [path]
+    is_folder = path.is_dir()
+    files = path.iterdir() if is_folder else [path]
     states = [file.stat() for file in files if file.is_file()]
-    beside = path.with_name(f'{path.name if path.is_dir() else path.stem}.yaml')
-    has_parameters = beside.is_file()
-    return Bag(
-        str(path),
-        sum(state.st_size for state in states) if states else -1,
-        max((state.st_mtime_ns for state in states), default=0),
-        beside.read_text(encoding='utf-8', errors='replace') if has_parameters else '',
-    )
+    size = sum(state.st_size for state in states) if states else -1
+    changed_ns = max((state.st_mtime_ns for state in states), default=0)
+    name = path.name if is_folder else path.stem
+    beside = path.with_name(f'{name}.yaml')
+    parameters = ''
+    if beside.is_file():
+        parameters = beside.read_text(encoding='utf-8', errors='replace')
+    return Bag(str(path), size, changed_ns, parameters)
 
 
 def unique_names(paths: Sequence[str]) -> list[str]:
     """Names for the results of bags: their own, with the folders below the one of all."""
     bags = [Path(path).absolute() for path in paths]
-    common = os.path.commonpath([bag.parent for bag in bags])
+    folders = [bag.parent for bag in bags]
+    common = os.path.commonpath(folders)
     long = [bag.relative_to(common) for bag in bags]
     short = [name.with_suffix('') if name.suffix in SUFFIXES else name for name in long]
-    names = short if len({*short}) == len(short) else long
+    are_unique = len({*short}) == len(short)
+    names = short if are_unique else long
     return ['__'.join(name.parts) for name in names]
 
 
@@ -534,10 +537,11 @@ def earlier(job: Job, folder: Path) -> Row | None:
     own = folder / job.name
     with suppress(OSError, ValueError, KeyError, TypeError):
         entry = json.loads((own / _JOB_FILE).read_text(encoding='utf-8'))
+        row = dict(entry['row'])
         is_same = entry['fingerprint'] == job.fingerprint
         has_files = all((own / name).is_file() for name in entry['files'])
-        if is_same and has_files and entry['row']['state'] in _LASTING:
-            return dict(entry['row'])
+        if is_same and has_files and row['state'] in _LASTING:
+            return row
     return None
 
 
@@ -550,8 +554,9 @@ def store(job: Job, row: Row, files: Files, folder: Path) -> None:
     entry = {'fingerprint': job.fingerprint, 'row': row, 'files': sorted(files)}
     text = json.dumps(entry, indent=1) + '\n'
     for name, data in (*files.items(), (_JOB_FILE, text.encode())):
-        (own / name).parent.mkdir(parents=True, exist_ok=True)
-        with written(own / name, 'wb') as file:
+        path = own / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with written(path, 'wb') as file:
             file.write(data)
 
 
@@ -566,44 +571,31 @@ def write_table(rows: Sequence[Row], folder: Path) -> None:
 
 def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> list[str]:
     """Write summary.json and the picture of a run with jobs such as this; lines to print."""
-    combined = combine(
-        [row for row in rows if job.command == 'calibrate' and row['state'] in (DONE, FINDINGS)]
-    )
-    states = {state: [row['state'] for row in rows].count(state) for state in STATES}
-    with written(folder / SUMMARY_FILE) as file:
-        file.write(
-            json.dumps(
-                {
-                    'command': job.command,
-                    'options': job.options,
-                    'version': job.version,
-                    'bags': len(rows),
-                    'states': states,
-                    'combined': combined,
-                },
-                indent=1,
-            )
-            + '\n'
-        )
-    draw(job.command, rows, combined['figures'], folder / PICTURE_FILE)
-    lines = [
-        f'{len(rows)} bags: '
-        + ', '.join(f'{count} {state}' for state, count in states.items() if count)
-        + (f'; {reused} of them from an earlier run' if reused else '')
+    calibrated = [
+        row for row in rows if job.command == 'calibrate' and row['state'] in (DONE, FINDINGS)
     ]
+    combined = combine(calibrated)
+    counts = Counter(row['state'] for row in rows)
+    states = {state: counts[state] for state in STATES}
+    summary = {
+        'command': job.command,
+        'options': job.options,
+        'version': job.version,
+        'bags': len(rows),
+        'states': states,
+        'combined': combined,
+    }
+    with written(folder / SUMMARY_FILE) as file:
+        file.write(json.dumps(summary, indent=1) + '\n')
+    draw(job.command, rows, combined['figures'], folder / PICTURE_FILE)
+    found = ', '.join(f'{count} {state}' for state, count in states.items() if count)
+    again = f'; {reused} of them from an earlier run' if reused else ''
+    lines = [f'{len(rows)} bags: {found}{again}']
     unfinished = [row for row in rows if row['state'] != DONE]
     lines += ['{state}: {bag}: {message}'.format(**row) for row in unfinished[:_MOST_LINES]]
     if len(unfinished) > _MOST_LINES:
         lines.append(f'... and {len(unfinished) - _MOST_LINES} more in {RESULTS_FILE}')
-    for one in combined['figures']:
-        if degrees := one['degrees_of_freedom']:
-            scale = math.sqrt(max(one['chi2'] / degrees, 1.0))
-            lines.append(
-                f'{one["figure"]}: {one["mean"]:.6g} +- {one["sigma"]:.2g}, of {degrees + 1} '
-                f'bags, chi2 {one["chi2"]:.3g} of {degrees} degrees of freedom'
-                + (f' (sigma times {scale:.2g})' if scale > 1.0 else '')
-                + (f'; outliers: {", ".join(one["outliers"])}' if one['outliers'] else '')
-            )
+    lines += [_line_of_mean(one) for one in combined['figures'] if one['degrees_of_freedom']]
     if combined['quat_cam_imu_xyzw'] is not None:
         numbers = ', '.join(f'{value:.6f}' for value in combined['quat_cam_imu_xyzw'])
         lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
@@ -611,6 +603,18 @@ def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> l
         f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for each bag'
     )
     return lines
+
+
+def _line_of_mean(one: Mapping[str, Any]) -> str:
+    """A result of `weighted_mean` of several bags, as a line to print."""
+    degrees = one['degrees_of_freedom']
+    scale = math.sqrt(max(one['chi2'] / degrees, 1.0))
+    scaled = f' (sigma times {scale:.2g})' if scale > 1.0 else ''
+    outliers = f'; outliers: {", ".join(one["outliers"])}' if one['outliers'] else ''
+    return (
+        f'{one["figure"]}: {one["mean"]:.6g} +- {one["sigma"]:.2g}, of {degrees + 1} '
+        f'bags, chi2 {one["chi2"]:.3g} of {degrees} degrees of freedom{scaled}{outliers}'
+    )
 
 
 # -- Calibrations of one camera from many bags: weighted means and outliers -----------------------
@@ -677,18 +681,12 @@ def combine(rows: Sequence[Row]) -> dict[str, Any]:
         good = [row for row in rows if row[f'{column}_observable']]
         names = [row['name'] for row in good]
         if good and metric != 'rotation':
-            combined.append(
-                weighted_mean(
-                    metric,
-                    names,
-                    [row[column] for row in good],
-                    [row[f'{column}_sigma'] for row in good],
-                )
-            )
+            values = [row[column] for row in good]
+            sigmas = [row[f'{column}_sigma'] for row in good]
+            combined.append(weighted_mean(metric, names, values, sigmas))
         elif good:
-            rotations = Rotation.from_quat(
-                [[row[f'quat_{axis}'] for axis in 'xyzw'] for row in good]
-            )
+            quaternions = [[row[f'quat_{axis}'] for axis in 'xyzw'] for row in good]
+            rotations = Rotation.from_quat(quaternions)
             near = rotations.mean()
             vectors = (rotations * near.inv()).as_rotvec()
             of_axes = [
@@ -731,25 +729,29 @@ def draw(
     for axes, (column, factor, label) in zip(both, _DRAWN[command], strict=True):
         outliers: Sequence[str] = ()
         if column in means:
-            mean = means[column]['mean']
-            sigma = means[column]['sigma']
-            outliers = means[column]['outliers']
-            axes.axvline(factor * mean, color=BLUE, linewidth=1.0)
-            axes.axvspan(factor * (mean - sigma), factor * (mean + sigma), color=BLUE, alpha=0.2)
+            mean = means[column]
+            outliers = mean['outliers']
+            middle = factor * mean['mean']
+            half = factor * mean['sigma']
+            axes.axvline(middle, color=BLUE, linewidth=1.0)
+            axes.axvspan(middle - half, middle + half, color=BLUE, alpha=0.2)
         for y, row in enumerate(rows):
             if row.get(column) is None:
                 continue
             colour = RED if row['name'] in outliers else BLUE
             if not row.get(f'{column}_observable', True):
                 colour = ORANGE
+            value = factor * row[column]
             sigma = factor * row.get(f'{column}_sigma', 0.0)
-            axes.errorbar(factor * row[column], y, fmt='o', color=colour, xerr=sigma)
+            axes.errorbar(value, y, fmt='o', color=colour, xerr=sigma)
         axes.set_xlabel(label)
         axes.grid(axis='x', color='0.9')
-    labels = [
-        row['name'][-40:] + ('' if row['state'] in (DONE, FINDINGS) else f' ({row["state"]})')
-        for row in rows
-    ]
-    both[0].set_yticks(range(len(rows)), labels)
-    both[0].set_ylim(len(rows) - 0.4, -0.6)
+    labels = []
+    for row in rows:
+        has_results = row['state'] in (DONE, FINDINGS)
+        state = '' if has_results else f' ({row["state"]})'
+        labels.append(row['name'][-40:] + state)
+    first, _ = both
+    first.set_yticks(range(len(rows)), labels)
+    first.set_ylim(len(rows) - 0.4, -0.6)
     save_picture(picture, path)

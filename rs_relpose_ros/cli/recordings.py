@@ -58,7 +58,8 @@ def calibrate_bag(
     refuse_unwritable(folder)
     read = [_recording(args, path, tracking) for path in (args.bag, *getattr(args, 'more', ()))]
     first = read[0]
-    recording, frames = first.recording, first.frames
+    recording = first.recording
+    frames = first.frames
     result, extra = _fitted(read, config)
     prepare_folder(folder, _CALIBRATION_FILES)
     names = ' '.join(one.path.name for one in read)

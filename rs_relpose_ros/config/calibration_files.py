@@ -138,8 +138,12 @@ def _inverse(T: Array) -> Array:
 
 def _noise(section: Mapping[str, Any]) -> dict[str, Any]:
     """Return the noise of an IMU; 0 is not known."""
-    found = {name: section[key] for key, name in _NOISE.items() if key in section}
-    return {name: float(value) for name, value in found.items() if float(value) > 0.0}
+    noise = {}
+    for key, name in _NOISE.items():
+        value = float(section.get(key, 0.0))
+        if value > 0.0:
+            noise[name] = value
+    return noise
 
 
 def _size(value: Any) -> tuple[int, int] | None:
@@ -209,10 +213,12 @@ def _orbslam(document: Mapping[str, Any]) -> Calibration:
     transform = document.get('IMU.T_b_c1', document.get('Tbc'))
     if transform is not None:
         values |= _extrinsics(_inverse(_matrix(transform)))
-    width = document.get('Camera.width')
-    height = document.get('Camera.height')
-    size = None if width is None or height is None else (int(width), int(height))
-    return Calibration('settings of ORB-SLAM3', values | _noise(document), size)
+    size = document.get('Camera.width'), document.get('Camera.height')
+    return Calibration(
+        'settings of ORB-SLAM3',
+        values | _noise(document),
+        None if None in size else _size(size),
+    )
 
 
 def _is_sensor(document: Mapping[str, Any]) -> bool:
@@ -239,12 +245,12 @@ def _is_ros(document: Mapping[str, Any]) -> bool:
 
 def _ros(document: Mapping[str, Any]) -> Calibration:
     """Read ost.yaml of camera_calibration, which has no IMU."""
-    k = document['camera_matrix']['data']
-    distortion = document.get('distortion_coefficients', {}).get('data') or ()
+    fx, _, cx, _, fy, cy, *_ = document['camera_matrix']['data']
+    distortion = document.get('distortion_coefficients', {})
     model = document.get('distortion_model', 'plumb_bob')
-    values = _lens(model, (k[0], k[4], k[2], k[5]), distortion)
-    size = int(document['image_width']), int(document['image_height'])
-    return Calibration('camera_calibration of ROS', values, size)
+    values = _lens(model, (fx, fy, cx, cy), distortion.get('data') or ())
+    size = document['image_width'], document['image_height']
+    return Calibration('camera_calibration of ROS', values, _size(size))
 
 
 # Each tool has a test whether a document is its own, and a reader. [derived: the keys of the

@@ -141,8 +141,10 @@ def rotations(name: str, value: ArrayLike | None, shape: tuple[int | str, ...] =
     """Check a rotation matrix (3, 3), or several of them (K, 3, 3)."""
     # The bound keeps the product from overflowing.
     R = array(name, value, shape, largest=2.0)
-    deviation = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3))
-    if not ((deviation < _ROUNDING_ROTATION).all() and (np.linalg.det(R) > 0.0).all()):
+    squared = np.swapaxes(R, -1, -2) @ R
+    is_orthonormal = np.abs(squared - np.eye(3)) < _ROUNDING_ROTATION
+    is_right_handed = np.linalg.det(R) > 0.0
+    if not (is_orthonormal.all() and is_right_handed.all()):
         raise InputError(
             f'{name} must be a rotation matrix (orthonormal, determinant +1), got {R.tolist()}'
         )
@@ -161,10 +163,12 @@ def covariance(
     """Check a symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
     matrix = array(name, value, (size, size), largest=largest, unit=unit)
     most = np.abs(matrix).max()
-    if most > 0.0 and (
-        np.abs(matrix - matrix.T).max() > _ROUNDING_SYMMETRY * max(1.0, most)
-        or np.linalg.eigvalsh(matrix)[0] < -rounding
-    ):
+    if not most:
+        return matrix
+    asymmetry = np.abs(matrix - matrix.T).max()
+    least_eigenvalue = np.linalg.eigvalsh(matrix)[0]
+    is_symmetric = asymmetry <= _ROUNDING_SYMMETRY * max(1.0, most)
+    if not is_symmetric or least_eigenvalue < -rounding:
         raise InputError(
             f'{name} must be a covariance matrix (symmetric, no negative '
             f'eigenvalue), got {matrix.tolist()}'

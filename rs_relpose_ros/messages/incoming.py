@@ -214,7 +214,7 @@ def sensor_messages(
         if role in roles and (topic := getattr(topics, role.value)) is not None
     }
     if not faulty and Role.IMU in roles and Role.IMAGE in roles:
-        for fault in check_timelines(bag.timeline, topics):
+        for fault in check_timelines(bag.timeline, topics).values():
             if fault.withholds:
                 raise InputError(f'{bag.path}: {fault}')
     streams = {name: Stream(name) for name, (role, _) in found.items() if role is not Role.TRUTH}

@@ -1,6 +1,6 @@
 """What is wrong with the stamps and the publishers of a stream, for check, replay and the nodes.
 
-Offline the stamps of the whole stream are known before its messages (`stream_faults`); a node
+Offline the stamps of the whole stream are known before its messages (`check_timelines`); a node
 knows the last ones (`Stream`). Both use the same rules:
 
 | fault | rule |
@@ -126,24 +126,32 @@ def counter_unit(step: float, interval: float) -> str:
     return ''
 
 
-def stream_faults(
-    image: Timeline | None, imu: Timeline | None, accel: Timeline | None
-) -> list[StreamFault]:
-    """Return the faults of the streams of a recording, by the stamps of all messages."""
+def check_timelines(timeline: Callable[[Any], Timeline], topics: Any) -> dict[Kind, StreamFault]:
+    """Return the faults of the streams of a bag by their kind, from the stamps of all messages.
+
+    `timeline` of the bag; `topics` by role, None for one that it lacks.
+    """
+    image, imu, accel = (
+        None if topic is None else timeline(topic)
+        for topic in (topics.image, topics.imu, topics.accel)
+    )
+    if imu is None:
+        return {}
     faults = []
-    if imu is not None and (bursts := _bursts_of(imu)) is not None:
+    if (bursts := _bursts_of(imu)) is not None:
         faults.append(bursts)
-    if image is not None and imu is not None and len(image.stamps) and len(imu.stamps):
+    if image is not None and len(image.stamps) and len(imu.stamps):
         faults += _since_boot(image, imu)
-    if imu is not None and accel is not None and len(imu.stamps) and len(accel.stamps):
+    if accel is not None and len(imu.stamps) and len(accel.stamps):
         ahead = imu.delay - accel.delay
         if abs(ahead) > _OWN_CLOCK:
             faults.append(_accel_clock(accel.topic, ahead))
-    return faults
+    return {fault.kind: fault for fault in faults}
 
 
 def _since_boot(image: Timeline, imu: Timeline) -> list[StreamFault]:
-    image_ns, imu_ns = int(np.median(image.stamps)), int(np.median(imu.stamps))
+    image_ns = int(np.median(image.stamps))
+    imu_ns = int(np.median(imu.stamps))
     if (image_ns < _SINCE_1970_NS) == (imu_ns < _SINCE_1970_NS):
         return []
     boot, epoch = ('images are', 'IMU') if image_ns < imu_ns else ('IMU is', 'images')
@@ -153,7 +161,8 @@ def _since_boot(image: Timeline, imu: Timeline) -> list[StreamFault]:
         f'the {epoch} with the time since 1970'
     )
     fix = 'have both drivers stamp with one clock (ROS time)'
-    return [StreamFault(Kind.SINCE_BOOT, message, fix, {'apart_s': (image_ns - imu_ns) * 1e-9})]
+    measured = {'apart_s': (image_ns - imu_ns) * 1e-9}
+    return [StreamFault(Kind.SINCE_BOOT, message, fix, measured)]
 
 
 def _accel_clock(topic: str, ahead: float) -> StreamFault:
@@ -182,28 +191,26 @@ _LARGEST_FACTOR = 8
 _MOST = 0.9
 
 
-class Multiplied(NamedTuple):
-    """Samples of a sensor that its driver has multiplied."""
+def find_multiplied(values: Array) -> tuple[float, str]:
+    """How a driver has multiplied the samples of a sensor, by the values (N, 3) of its messages.
 
-    factor: float  # messages for each sample of the sensor
-    how: str  # 'repeated' or 'interpolated'
-
-
-def find_multiplied(values: Array) -> Multiplied | None:
-    """Return how the values (N, 3) of messages were multiplied; None for a sample in each."""
+    Messages for each sample, and 'repeated' or 'interpolated'; 1 and '' for a sample in each.
+    """
     if len(values) < _FEWEST_VALUES or not np.ptp(values, axis=0).any():
-        return None
+        return 1.0, ''
     steps = np.diff(values, axis=0)
     repeated: NDArray[np.bool_] = np.all(steps == 0.0, axis=1)
     bends = np.abs(np.diff(steps, axis=0)).max(axis=1)
     typical = float(np.quantile(bends, _MOST))
     on_line: NDArray[np.bool_] = np.asarray(bends < _ON_LINE * typical)
     for how, multiplied in (('repeated', repeated), ('interpolated', on_line)):
-        new = len(multiplied) - int(multiplied.sum())
-        factor = len(multiplied) / max(new, 1)
-        if 1.5 <= factor <= _LARGEST_FACTOR and _is_regular(multiplied, round(factor)):
-            return Multiplied(factor, how)
-    return None
+        count = len(multiplied)
+        new = count - int(multiplied.sum())
+        factor = count / max(new, 1)
+        is_likely = 1.5 <= factor <= _LARGEST_FACTOR
+        if is_likely and _is_regular(multiplied, round(factor)):
+            return factor, how
+    return 1.0, ''
 
 
 # Error of the mean of an interval that is interpolated between its ends, in units of the second
@@ -237,21 +244,26 @@ class SensorRate:
         if self._count % _EVERY:
             return False
         values = np.array(self._rates)
-        found = find_multiplied(values)
-        factor = 1 if found is None else round(found.factor)
-        changed, self.factor = factor != self.factor, float(factor)
+        found, _ = find_multiplied(values)
+        factor = round(found)
+        changed = factor != self.factor
+        self.factor = float(factor)
         self.between = 0.0
         if factor > 1:
             step = float(np.median(np.diff(self._stamps))) / NANOSECONDS
             bends = np.diff(values[::factor], n=2, axis=0)
-            self.between = factor * step * _TRAPEZOID**2 * float(np.mean(bends**2))
+            variance = _TRAPEZOID**2 * float(np.mean(bends**2))
+            self.between = factor * step * variance
         return changed
 
 
 def _is_regular(multiplied: NDArray[np.bool_], factor: int) -> bool:
     """Tell whether one of `factor` values is new, in a regular order."""
     places = np.flatnonzero(~multiplied)
-    return len(places) > 2 and float(np.mean(np.diff(places) == factor)) > _MOST
+    if len(places) <= 2:
+        return False
+    is_step = np.diff(places) == factor
+    return float(np.mean(is_step)) > _MOST
 
 
 # -- Publishers and stamps, message by message ----------------------------------------------------
@@ -298,12 +310,3 @@ class Stream:
                 f'{self.topic}: nanosec of the stamps is above 999999999 ({int(stamp.nanosec)}): '
                 'the driver cast a time of 64 bits to 32; correct its stamps'
             )
-
-
-def check_timelines(timeline: Callable[[Any], Any], topics: Any) -> list[StreamFault]:
-    """Return the faults of the streams of a bag; `timeline` of it, `topics` by role or None."""
-
-    def of(topic: Any) -> Timeline | None:
-        return None if topic is None else Timeline(topic.name, *timeline(topic))
-
-    return stream_faults(of(topics.image), of(topics.imu), of(topics.accel))

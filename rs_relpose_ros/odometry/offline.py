@@ -360,12 +360,12 @@ def follow(
 
 def _require_accelerometer(bag: Bag, topics: SensorTopics) -> None:
     """InputError for an accelerometer on another clock, by which a path would be wrong."""
-    for fault in check_timelines(bag.timeline, topics):
-        if fault.kind is Kind.ACCEL_CLOCK:
-            raise InputError(
-                f'{bag.path}: {fault.message}, and a path needs both sensors: have their driver '
-                'stamp them with one clock; "rs_relpose replay" needs the gyro alone'
-            )
+    fault = check_timelines(bag.timeline, topics).get(Kind.ACCEL_CLOCK)
+    if fault is not None:
+        raise InputError(
+            f'{bag.path}: {fault.message}, and a path needs both sensors: have their driver '
+            'stamp them with one clock; "rs_relpose replay" needs the gyro alone'
+        )
 
 
 def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]]:

@@ -341,8 +341,7 @@ def _between(
     closing = Rotation.from_rotvec(share * error)
     R = by_gyro * closing
     forces = R.apply(interval.forces - one.accel_bias)
-    steps = np.diff(interval.seconds)
-    once, twice = force_integrals(steps, forces)
+    once, twice = force_integrals(interval.seconds, forces)
     velocity = one.velocity + once + seconds * _GRAVITY
     position = one.position + seconds * one.velocity + twice + 0.5 * seconds**2 * _GRAVITY
     # The errors of position and velocity there are spread as a cubic polynomial.

@@ -63,10 +63,11 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     bag.time_offset = parameters.sensor.time_offset
     scan = Scan(images, parameters.intrinsics)
-    completion, sample, topics = Completion(parameters), None, None
+    completion = Completion(parameters)
+    sample = None
     source = scan.added(sensor_messages(bag, chosen, faulty=True))
-    if chosen.image is not None and chosen.imu is not None:
-        topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
+    topics = chosen.sensors
+    if topics is not None:
         completion = check_recording.completed(bag, topics, parameters)
         if not completion.parameters.sensor.missing():
             sample = check_recording.sampled(source, images, completion.parameters)
@@ -76,10 +77,9 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     if topics is not None:
         if sample is not None and sample.is_lost and completion.found is None:
             with suppress(InputError):  # the recording permits no calibration
-                completion = completion._replace(
-                    found=check_recording.calibrated(bag, topics, completion.parameters)
-                )
-        faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
+                found = check_recording.calibrated(bag, topics, completion.parameters)
+                completion = completion._replace(found=found)
+        faults = check_timelines(bag.timeline, chosen)
         offset = None
         doubtful = sample is not None and (not sample.poses or sample.health.state is WRONG)
         if doubtful and not any(fault.withholds for fault in faults.values()):
@@ -111,7 +111,7 @@ def stream_findings(
             _calibration(scan),
             _transport(scan, chosen.image, bag.reliability(chosen.image)),
         ]
-    faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
+    faults = check_timelines(bag.timeline, chosen)
     if chosen.imu is not None:
         findings += _imu(scan, bag.reliability(chosen.imu), parameters, faults)
     return findings
@@ -138,7 +138,8 @@ def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Line:
 
 
 def _parameters(parameters: Parameters) -> Line:
-    sensor, missing = parameters.sensor, parameters.sensor.missing()
+    sensor = parameters.sensor
+    missing = parameters.sensor.missing()
     if missing:
         return property_line(
             Code.PARAMETERS,
@@ -186,11 +187,14 @@ def _no_step(name: Code, stamps: Stamps, measured: dict[str, Any]) -> Line:
 
 def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
     """Order and evenness of stamps; those of images may follow an exposure."""
-    varying, first_ns = Varying.JITTER, np.unique(stamps.ns[:_MOST_STAMPS])
+    varying = Varying.JITTER
     if of == 'the camera':
+        first_ns = np.unique(stamps.ns[:_MOST_STAMPS])
         varying = frame_times(first_ns).varying if len(first_ns) > 2 else Varying.UNCLEAR
-    repeated, backwards = int((stamps.steps == 0.0).sum()), int((stamps.steps < 0.0).sum())
-    jitter, furthest_back = stamps.jitter, abs(float(stamps.steps.min(initial=0.0)))
+    jitter = stamps.jitter
+    repeated = int((stamps.steps == 0.0).sum())
+    backwards = int((stamps.steps < 0.0).sum())
+    furthest_back = abs(float(stamps.steps.min(initial=0.0)))
     measured = {
         'jitter_s': jitter,
         'repeated': repeated,
@@ -200,7 +204,8 @@ def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
     }
     if not stamps.interval > 0.0:
         return _no_step(name, stamps, measured)
-    text, unordered = f'jitter {1e3 * jitter:.2f} ms', repeated + backwards
+    text = f'jitter {1e3 * jitter:.2f} ms'
+    unordered = repeated + backwards
     if unordered:
         text += f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} s)'
     unit = counter_unit(furthest_back, stamps.interval) if furthest_back > 0.0 else ''
@@ -310,7 +315,9 @@ def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Line]:
 
 
 def _rate(stamps: Stamps) -> Line:
-    name, interval, duration = Code.IMAGE_RATE, stamps.interval, stamps.duration
+    name = Code.IMAGE_RATE
+    interval = stamps.interval
+    duration = stamps.duration
     if not interval > 0.0:
         return property_line(
             name,
@@ -320,7 +327,8 @@ def _rate(stamps: Stamps) -> Line:
             {'count': stamps.count},
         )
     # Each longer step hides frames; 1.5 of a step occurs even with automatic exposure.
-    gaps, longest = int((stamps.forwards > 1.7 * interval).sum()), stamps.longest
+    gaps = int((stamps.forwards > 1.7 * interval).sum())
+    longest = stamps.longest
     missed = max(round(duration / interval) - stamps.count + 1, 0) if gaps else 0
     text = f'{1.0 / interval:.1f} Hz, {stamps.count} in {duration:.1f} s'
     if gaps:
@@ -351,7 +359,8 @@ def _rate(stamps: Stamps) -> Line:
 
 
 def _calibration(scan: Scan) -> Line:
-    name, intrinsics = Code.CALIBRATION, scan.intrinsics
+    name = Code.CALIBRATION
+    intrinsics = scan.intrinsics
     if intrinsics is None:
         return property_line(
             name,
@@ -483,11 +492,11 @@ def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
     if not stamps.interval > 0.0:
         return _no_step(Code.IMU_RATE, stamps, {})
     gaps = int((stamps.forwards > gap).sum())
-    hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
+    hertz = 1.0 / stamps.interval
+    unusable = scan.unusable[Role.IMU]
     recorded = f', recorded as {reliability}' if reliability else ''
-    multiplied = find_multiplied(scan.rates)
-    how = '' if multiplied is None else multiplied.how
-    true = hertz if multiplied is None else hertz / multiplied.factor
+    factor, how = find_multiplied(scan.rates)
+    true = hertz / factor
     return by_case(
         Code.IMU_RATE,
         f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
@@ -537,7 +546,8 @@ def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
 
 def _gyro(scan: Scan) -> Line:
     rates = np.linalg.norm(scan.rates, axis=1)
-    median, high = float(np.median(rates)), float(np.percentile(rates, 95))
+    median = float(np.median(rates))
+    high = float(np.percentile(rates, 95))
     return by_case(
         Code.GYRO,
         f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
@@ -558,8 +568,10 @@ def _gyro(scan: Scan) -> Line:
 
 
 def _bias(scan: Scan, parameters: Parameters) -> Line:
-    configured, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
-    name, rest = Code.GYRO_AT_REST, scan.rest
+    configured = parameters.imu.gyro_bias
+    sigma = parameters.imu.gyro_bias_sigma
+    name = Code.GYRO_AT_REST
+    rest = scan.rest
     if rest is None:
         return property_line(
             name,
@@ -585,7 +597,8 @@ def _bias(scan: Scan, parameters: Parameters) -> Line:
 
 
 def _accelerometer(scan: Scan) -> Line:
-    name, forces = Code.GRAVITY, scan.forces
+    name = Code.GRAVITY
+    forces = scan.forces
     if not len(forces):
         return by_case(
             name,
@@ -679,19 +692,19 @@ def joint_findings(
     found = [_overlap(scan, parameters, has_poses, offset)]
     if Kind.SINCE_BOOT in faults:
         found = [_of_fault(Code.CLOCKS, WRONG, faults[Kind.SINCE_BOOT])]
-    cause = next((fault for fault in faults.values() if fault.withholds), None)
-    why = 'the clocks differ' if offset is not None else cause and cause.message
+    clocks_differ = 'the clocks differ' if offset is not None else ''
+    causes = [fault.message for fault in faults.values() if fault.withholds]
+    why = clocks_differ or next(iter(causes), '')
     if sample is not None and why:
         found.append(property_line(Code.PAIRS, UNKNOWN, f'not measured: {why}', '', {}))
     elif sample is not None:
         found += [_pairs(sample, health), _texture(sample, health)]
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
-    reason = reason if offset is None else 'the clocks differ'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
     found += [_not_configured(code, completion, scan) for code in sorted(missing)]
     bursts = faults.get(Kind.BURSTS)
     doubt = bursts.measured['offset_sigma_s'] if bursts else None
-    lines = quantity_findings(health, reason, doubt or 0.0)
+    lines = quantity_findings(health, clocks_differ or reason, doubt or 0.0)
     found += [line for line in lines if line.code not in missing]
     effect = _effect(scan, health, completion.parameters)
     return found if effect is None else [*found, effect]
@@ -717,11 +730,15 @@ def _overlap(
 
     If there are poses the stamps are right, and a difference of the delays is that of delivery.
     """
-    name, images, imu = Code.CLOCKS, scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
+    name = Code.CLOCKS
+    images = scan.stamps(Role.IMAGE)
+    imu = scan.stamps(Role.IMU)
     if not images.count or not imu.count:
         return property_line(name, WRONG, 'no stamps to compare', 'correct the topics above', {})
-    image_ns, imu_ns = images.ns + round(parameters.sensor.time_offset * 1e9), imu.ns
-    common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
+    image_ns = images.ns + round(parameters.sensor.time_offset * 1e9)
+    begin_ns = max(image_ns.min(), imu.ns.min())
+    end_ns = min(image_ns.max(), imu.ns.max())
+    common = int(end_ns - begin_ns) * 1e-9
     apart = images.delay - imu.delay
     measured = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
     apart_too_far = max(_SAME_CLOCK, 0.5 * images.duration)
@@ -762,7 +779,8 @@ def _overlap(
 
 
 def _pairs(sample: Sample, health: Assessment) -> Line:
-    pairs, posed = len(sample.matches), sample.poses
+    pairs = len(sample.matches)
+    posed = sample.poses
     reason = next(iter(sample.reasons.most_common()), 'too few images were processed')
     return by_case(
         Code.PAIRS,
@@ -824,7 +842,8 @@ def _texture(sample: Sample, health: Assessment) -> Line:
 
 def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
-    found, health = completion.found, sample.health
+    found = completion.found
+    health = sample.health
     # No calibration finds another unit, nor axes that no rotation corrects.
     beyond = any(
         fault.code is Code.GYRO_UNIT or (fault.code is Code.AXES and not fault.estimated)
@@ -935,16 +954,23 @@ def _not_configured(code: Code, completion: Completion, scan: Scan) -> Line:
 
 def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Line | None:
     """Displacement of the last row relative to the first by rotation alone [px]."""
-    name, intrinsics, rest = Code.ROLLING_SHUTTER, scan.intrinsics, scan.rest
+    name = Code.ROLLING_SHUTTER
+    intrinsics = scan.intrinsics
+    rest = scan.rest
     if intrinsics is None or not len(scan.rates):
         return None
     configured = parameters.sensor.readout_time
     found = {finding.code: finding for finding in health.findings}.get(Code.READOUT_TIME)
-    readout, source, state = configured, '', OK
+    readout = configured
+    source = ''
+    state = OK
     if found is not None and found.estimate is not None and _state(found) in (SUSPECT, WRONG):
-        readout, source = found.estimate, ' as estimated'
+        readout = found.estimate
+        source = ' as estimated'
     elif configured is None:
-        readout, source, state = _EXAMPLE_READOUT, ' (assumed; set readout_time)', UNKNOWN
+        readout = _EXAMPLE_READOUT
+        source = ' (assumed; set readout_time)'
+        state = UNKNOWN
     elif configured == 0.0:
         return by_case(
             name,

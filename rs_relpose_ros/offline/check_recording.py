@@ -32,6 +32,7 @@ from rs_relpose_ros.calibration.findings import (
 from rs_relpose_ros.calibration.residual_maps import ResidualMaps, with_maps
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
+from rs_relpose_ros.core.losses import SIGMA_PER_MEDIAN
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
@@ -71,19 +72,24 @@ class Stamps:
     def __init__(self, stamps_ns: Sequence[int], recorded_ns: Sequence[int]) -> None:
         recorded = np.array(recorded_ns, dtype=np.int64)
         order = np.argsort(recorded, kind='stable')
+        recorded = recorded[order]
         self.ns = np.array(stamps_ns, dtype=np.int64)[order]
         self.count = len(self.ns)
-        delays = (recorded[order] - self.ns) * 1e-9
-        self.delay = float(np.median(delays)) if self.count else math.nan
-        self.duration = int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0  # [s]
+        self.delay = math.nan
+        self.duration = 0.0  # [s]
+        if self.count:
+            self.delay = float(np.median((recorded - self.ns) * 1e-9))
+            self.duration = int(np.ptp(self.ns)) * 1e-9
         self.steps = np.diff(self.ns) * 1e-9  # (N - 1,) [s]; some may be zero or negative
         self.forwards = self.steps[self.steps > 0.0]
         self.longest = float(self.forwards.max(initial=0.0))
-        # Median of the steps forwards [s], and 1.48 times their median deviation from it.
-        self.interval, self.jitter = math.nan, 0.0
+        # Median of the steps forwards [s], and the robust sigma of a step about it.
+        self.interval = math.nan
+        self.jitter = 0.0
         if len(self.forwards):
             self.interval = float(np.median(self.forwards))
-            self.jitter = 1.4826 * float(np.median(np.abs(self.forwards - self.interval)))
+            deviations = np.abs(self.forwards - self.interval)
+            self.jitter = SIGMA_PER_MEDIAN * float(np.median(deviations))
 
 
 class Scan:
@@ -96,7 +102,8 @@ class Scan:
         self.configured = configured
         self._every = max(images // _DECODED, 1)
         self._stamps = {role: (array('q'), array('q')) for role in (Role.IMAGE, Role.IMU)}
-        self._rates, self._forces = array('d'), array('d')
+        self._rates = array('d')
+        self._forces = array('d')
         self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
         self.orientations = 0  # of the IMU, with a covariance
         self.encodings: Counter[str] = Counter()  # images by encoding or format
@@ -222,7 +229,8 @@ class Completion(NamedTuple):
 
 def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
     """Calibration without initial values, of images in the middle of the recording."""
-    tracking, images = parameters.tracking, topics.image.count
+    tracking = parameters.tracking
+    images = topics.image.count
     first = _first_of_middle(topics)
     recording = read_recording(
         bag,
@@ -230,7 +238,8 @@ def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calibr
         settings.TrackingConfig(detector=tracking.detector, feature_rows=tracking.feature_rows),
         images=range(first, first + min(images, _CALIBRATED_IMAGES)),
     )
-    camera, given = recording.camera, parameters.intrinsics
+    camera = recording.camera
+    given = parameters.intrinsics
     if given.given:
         recording = replace(
             recording,
@@ -249,7 +258,8 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Complet
         found = calibrated(bag, topics, parameters)
     except InputError as error:
         return Completion(parameters, None, str(error))
-    readout, axes = found.readout_time, found.rotation
+    readout = found.readout_time
+    axes = found.rotation
     values: dict[str, Any] = {}
     problems = [
         estimate.remark
@@ -275,7 +285,8 @@ def contradicted(
     """
     if not found.time_offset.observable:
         return ()
-    readout, camera = found.readout_time, model.camera
+    readout = found.readout_time
+    camera = model.camera
     angle = float(Rotation.from_matrix(found.R_cam_imu @ sensor.R_cam_imu.T).magnitude())
     # Of the stamped row; the calibration has that of row 0, at the median interval.
     share = camera.reference_row_index / camera.row_count
@@ -356,15 +367,18 @@ def found_offset(
 
     None if the recording does not determine it, or if no pair has a pose with it.
     """
-    recorder, first = Recorder(parameters.tracking), _first_of_middle(topics)
+    recorder = Recorder(parameters.tracking)
+    first = _first_of_middle(topics)
     number = 0
     for role, message in sensor_messages(bag, topics, faulty=True):
         of_middle = first <= number < first + _CALIBRATED_IMAGES
-        if role in (Role.IMU, Role.CAMERA_INFO) or (role is Role.IMAGE and of_middle):
+        is_image = role is Role.IMAGE
+        if role in (Role.IMU, Role.CAMERA_INFO) or (is_image and of_middle):
             recorder.add(role, message.message)
-        number += role is Role.IMAGE
+        number += is_image
     recording = recorder.recording()
-    gyro, shift_ns = recording.gyro, to_nanoseconds(apart)
+    gyro = recording.gyro
+    shift_ns = to_nanoseconds(apart)
     shifted = replace(recording, gyro=replace(gyro, stamps_ns=gyro.stamps_ns - shift_ns))
     found = shifted.calibrated(settings.TRACKED_IN_IMAGES)
     if not found.time_offset.observable:
@@ -425,7 +439,9 @@ def sampled(
     counts: Counter[str] = Counter()  # of images: handed to the front end, and done there
     unused = ReasonCounts()
     chosen = _of_parts(source, front_end, images, counts, unused)
-    poseless, matches, poses = ReasonCounts(), list[int](), 0
+    poseless = ReasonCounts()
+    matches = list[int]()
+    poses = 0
     frames = part_since_ns = last_ns = 0
     before = findings.NOT_EVALUATED  # of the settled parts
     intake = Intake(front_end.sequencer, parameters)
@@ -446,7 +462,8 @@ def sampled(
         if not pair.pose:
             poseless.add(pair.pose.reason)
         if not matches or not 0 <= pair.stamp_ns - last_ns < _APART_NS:
-            before, part_since_ns = findings.worst_of(before, pair.health), pair.stamp_ns
+            before = findings.worst_of(before, pair.health)
+            part_since_ns = pair.stamp_ns
         if pair.stamp_ns - part_since_ns >= _SETTLED_NS:
             before = findings.worst_of(before, front_end.health)
         matches.append(len(pair.matches))

@@ -42,16 +42,18 @@ class Line(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """The line in `check --json`."""
         finding = self.finding
-        text = Text(self.message, self.fix)
+        if finding.code.is_property:
+            measured = dict(finding.evidence.measured)
+        else:
+            measured = findings_text.earlier_keys(finding, Text(self.message, self.fix))
         return {
             'name': finding.code.value,
             'verdict': finding.state.verdict,
             'text': self.message,
             'remedy': self.fix,
-            'figures': dict(finding.evidence.measured)
-            if finding.code.is_property
-            else findings_text.earlier_keys(finding, text),
-        } | findings_text.new_keys(finding)
+            'figures': measured,
+            **findings_text.new_keys(finding),
+        }
 
 
 def property_line(
@@ -59,7 +61,8 @@ def property_line(
 ) -> Line:
     """Line on a property of the recording."""
     why = {OK: Why.CONSISTENT, UNKNOWN: Why.NOT_MEASURED}.get(state, Why.OFF)
-    return Line(Finding(code, state, why, evidence=Evidence(measured=measured)), message, fix)
+    finding = Finding(code, state, why, evidence=Evidence(measured=measured))
+    return Line(finding, message, fix)
 
 
 class Case(NamedTuple):
@@ -154,13 +157,15 @@ class CheckReport:
 
         What follows from a finding is indented below it.
         """
-        names = max(len(finding.code.value) for finding in self.findings) + len(_INDENT)
-        listed: list[str] = []
+        longest = max(len(finding.code.value) for finding in self.findings)
+        names = longest + len(_INDENT)
+        lines = [self.verdict]
         for finding, indent in _in_order(self.findings):
-            listed += _wrapped(finding, indent, names, width)
+            lines += _wrapped(finding, indent, names, width)
         counts = Counter(finding.state for finding in self.findings)
         numbers = ', '.join(f'{counts[state]} {state.verdict}' for state in FindingState)
-        return [self.verdict, *listed, f'{self.bag}: {numbers}']
+        lines.append(f'{self.bag}: {numbers}')
+        return lines
 
     def to_mapping(self) -> dict[str, Any]:
         """The report as data for JSON."""

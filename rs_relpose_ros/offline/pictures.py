@@ -120,7 +120,8 @@ def draw_rotation(
     chains = _chains(records, truth)
     against = list(chains)[-1]  # the ground truth, or else the gyro
     start_ns = records[0].reference_ns1
-    times = [0.0, *_spans(records, start_ns)[1]]
+    _, ends = _spans(records, start_ns)
+    times = [0.0, *ends]
     picture = _over_time(
         2, 'orientation against the first keyframe: the rotations of the pairs, chained'
     )
@@ -133,12 +134,11 @@ def draw_rotation(
         label = against if column == 2 else None
         above.plot(times, reference[:, column], '--', color='black', linewidth=1.0, label=label)
     above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
-    for (name, chain), color in zip(chains.items(), (BLUE, ORANGE), strict=False):
-        if name != against:
-            pairs = zip(chain, chains[against], strict=True)
-            angles = [rotation_angle(R.T @ R_against) for R, R_against in pairs]
-            label = f'{name} against {against}'
-            below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4, label=label)
+    *others, true = chains.values()
+    for name, chain, color in zip(chains, others, (BLUE, ORANGE), strict=False):
+        angles = [rotation_angle(R.T @ R_true) for R, R_true in zip(chain, true, strict=True)]
+        label = f'{name} against {against}'
+        below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4, label=label)
     below.set_ylabel('difference, accumulated\n[deg]')
     title = 'drift of the chain: errors of pairs accumulate, as in any odometry'
     below.set_title(title, fontsize=9, loc='left')
@@ -172,10 +172,11 @@ def _chains(records: Sequence[PairRecord], truth: TrueTrajectory | None) -> dict
 
 def _vectors(chain: Sequence[Array]) -> Array:
     """Rotation vectors (N, 3) [deg]; NaN where a rotation is not known."""
-    unknown = np.full(3, np.nan)
-    return np.degrees(
-        [Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else unknown for R in chain]
-    )
+    vectors = np.full((len(chain), 3), np.nan)
+    for vector, R in zip(vectors, chain, strict=True):
+        if np.isfinite(R).all():
+            vector[:] = Rotation.from_matrix(R).as_rotvec(degrees=True)
+    return vectors
 
 
 def _over_time(count: int, title: str) -> Figure:
@@ -224,10 +225,9 @@ def _shade_no_pose(
 
 def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[Array, Array]:
     """Times (N,) of the reference rows of both frames of the pairs [s]."""
-    return (
-        np.array([seconds_between(start_ns, r.reference_ns1) for r in records]),
-        np.array([seconds_between(start_ns, r.reference_ns2) for r in records]),
-    )
+    begins = [seconds_between(start_ns, record.reference_ns1) for record in records]
+    ends = [seconds_between(start_ns, record.reference_ns2) for record in records]
+    return np.array(begins), np.array(ends)
 
 
 def _accumulated(rotations: Sequence[Array]) -> list[Array]:

@@ -32,7 +32,7 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
-from rs_relpose_ros.geometry.timing import clocks_apart, NANOSECONDS
+from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.outgoing import pair_parts, PAIR_TOPICS
 from rs_relpose_ros.messages.streams import check_timelines
@@ -142,7 +142,7 @@ class Replay:
         """Run over the bag, and yield every pair; `last_ns` is then its bag time."""
         warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
-        for fault in check_timelines(self._bag.timeline, self._topics):
+        for fault in check_timelines(self._bag.timeline, self._topics).values():
             if not fault.withholds:
                 _logger.warning('%s', fault)
         for outcome in outcomes(self._front_end, self.intake, self._messages()):
@@ -185,9 +185,9 @@ class Replay:
 
     def _clocks_apart(self) -> str:
         """Message on clocks that differ by the times of recording; '' if they do not."""
-        images, imu = self._bag.timeline(self._topics.image), self._bag.timeline(self._topics.imu)
-        delays = [float(np.median(one.received - one.stamps)) for one in (images, imu)]
-        ahead = (delays[0] - delays[1]) / NANOSECONDS
+        images = self._bag.timeline(self._topics.image)
+        imu = self._bag.timeline(self._topics.imu)
+        ahead = images.delay - imu.delay
         return clocks_apart(ahead + self.parameters.sensor.time_offset)
 
     @property

@@ -43,9 +43,8 @@ class TrueTrajectory:
     """
 
     def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:
-        stamps = np.asarray(stamps_ns, dtype=np.int64)
-        order = np.argsort(stamps, kind='stable')
-        order = order[np.append(True, np.diff(stamps[order]) > 0)] if len(order) else order
+        # Of poses with the same stamp the first one holds.
+        stamps, order = np.unique(np.asarray(stamps_ns, dtype=np.int64), return_index=True)
         positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)[order]
         quats = np.asarray(quats_xyzw, dtype=np.float64).reshape(-1, 4)[order]
         if len(order) < _MIN_POSES:
@@ -61,7 +60,7 @@ class TrueTrajectory:
                 'the ground truth has a pose that is not finite or beyond the moon, or whose '
                 'quaternion has not the length 1'
             )
-        self._stamps = stamps[order]
+        self._stamps = stamps
         seconds = self._seconds(self._stamps)
         self._position = CubicSpline(seconds, positions)
         self._rotation = Slerp(seconds, Rotation.from_quat(quats))

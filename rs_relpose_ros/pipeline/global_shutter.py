@@ -58,14 +58,16 @@ class RowMap(NamedTuple):
         """Bands of rows, which fit into a cache, and sources (N, W, 2) for `cv2.remap`."""
         for top in range(0, self.height, _BAND):
             bottom = min(top + _BAND, self.height)
+            first_node = top // _STEP
             last_node = math.ceil(bottom / _STEP) + 2
-            nodes = self.nodes[top // _STEP : last_node]
+            nodes = self.nodes[first_node:last_node]
             rows, columns, _ = nodes.shape
             size = columns * _STEP, rows * _STEP
             band = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
             # The image begins one node inside of the band.
-            inner = band[_STEP:, _STEP:]
-            sources = inner[: bottom - top, : self.width]
+            begin = _STEP
+            height = bottom - top
+            sources = band[begin : begin + height, begin : begin + self.width]
             yield slice(top, bottom), np.asarray(sources)
 
 
@@ -93,12 +95,11 @@ class MiddleRow:
         # Rotations from the camera at the middle row to the camera at each of some rows:
         # R(tau)^T R_mid.
         rows = np.linspace(0.0, camera.row_count - 1.0, _ORIENTATIONS)
-        turns = np.einsum(
-            'nji,jk->nik',
-            motion.rotations(camera.row_times(rows)),
-            motion.rotations([self.delay])[0],
-        )
-        nodes = intrinsics.to_image(camera.project_rotating(self._rays, self._rows, turns))
+        of_rows = motion.rotations(camera.row_times(rows))
+        (of_middle,) = motion.rotations([self.delay])
+        turns = np.einsum('nji,jk->nik', of_rows, of_middle)
+        sources = camera.project_rotating(self._rays, self._rows, turns)
+        nodes = intrinsics.to_image(sources)
         shift = np.nanmax(np.abs(nodes - self._nodes), initial=0.0)
         return RowMap(
             nodes.reshape(*self._shape, 2).astype(np.float32),

@@ -2,14 +2,16 @@
 
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from itertools import chain
 import math
 from pathlib import PurePath
 import re
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibration.findings import Finding, FindingState
@@ -81,27 +83,28 @@ class Section(NamedTuple):
     content: str
 
 
-class _Writer:
-    """Makes HTML of texts, and leaves out what identifies the recording where that is wanted."""
+# Makes HTML of a text.
+Writer = Callable[[object], str]
 
-    def __init__(self, observation: Observation, anonymous: bool) -> None:
-        path = PurePath(observation.bag)
-        names = {observation.bag, path.name, path.stem, *observation.names}
-        long = sorted((one for one in names if len(one) >= _SHORTEST_NAME), key=len, reverse=True)
-        alternatives = '|'.join(map(re.escape, long)) if anonymous else ''
-        self._hidden = re.compile(alternatives) if alternatives else None
 
-    def text(self, text: object) -> str:
-        """A text as HTML."""
-        plain = str(text)
-        return escape(self._hidden.sub('[name]', plain) if self._hidden else plain)
+def _writer(observation: Observation, *, anonymous: bool) -> Writer:
+    """Return the writer of a page; an `anonymous` one hides what identifies the recording."""
+    path = PurePath(observation.bag)
+    names = {observation.bag, path.name, path.stem, *observation.names}
+    identifying = [one for one in names if len(one) >= _SHORTEST_NAME]
+    if not anonymous or not identifying:
+        return lambda text: escape(str(text))
+    # A name may contain a shorter one.
+    identifying.sort(key=len, reverse=True)
+    hidden = re.compile('|'.join(map(re.escape, identifying)))
+    return lambda text: escape(hidden.sub('[name]', str(text)))
 
 
 def page(observation: Observation, version: str, *, images: bool = True) -> str:
     """The report as HTML; without `images` also without positions and names."""
-    write = _Writer(observation, anonymous=not images)
+    write = _writer(observation, anonymous=not images)
     sections = [one for one in _sections(observation, write, images) if one.content]
-    title = write.text(PurePath(observation.bag).name) if images else 'a recording'
+    title = write(PurePath(observation.bag).name) if images else 'a recording'
     links = ''.join(f'<a href="#{one.anchor}">{one.heading}</a>' for one in sections)
     body = ''.join(
         f'<section id="{one.anchor}"><h2>{one.heading}</h2>{one.content}</section>'
@@ -109,7 +112,7 @@ def page(observation: Observation, version: str, *, images: bool = True) -> str:
     )
     broken = ''
     if observation.damage:
-        text = write.text(observation.damage)
+        text = write(observation.damage)
         broken = (
             '<div class="cards"><div class="wrong"><h2>The recording is damaged</h2>'
             f'<p>{text}</p><p>This page shows what could be read.</p></div></div>'
@@ -121,22 +124,24 @@ def page(observation: Observation, version: str, *, images: bool = True) -> str:
         f'<style>{_CSS}</style></head><body><h1>Report of {title}</h1>'
         f'<p class="soft">{_overview(observation, write)}</p>{broken}'
         f'{_cards(observation, write)}<nav>{links}</nav>{body}'
-        f'<p class="soft">Made by rs_relpose report, version {write.text(version)}.</p>'
+        f'<p class="soft">Made by rs_relpose report, version {write(version)}.</p>'
         '</body></html>\n'
     )
 
 
-def _sections(observation: Observation, write: _Writer, images: bool) -> Iterable[Section]:
+def _sections(observation: Observation, write: Writer, images: bool) -> Iterable[Section]:
     """All sections; one without content is left out."""
-    rates = plots.rates_of(observation)
     yield Section('findings', 'Findings', _findings(observation.lines, write))
-    yield Section('streams', 'Streams', _drawings(plots.streams(observation), write))
-    yield Section('imu', 'Gyro and accelerometer', _drawings(plots.inertial(observation), write))
+    streams = plots.streams(observation)
+    yield Section('streams', 'Streams', _drawings(streams, write))
+    inertial = plots.inertial(observation)
+    yield Section('imu', 'Gyro and accelerometer', _drawings(inertial, write))
+    rates = plots.rates_of(observation)
     clock = [] if rates is None else plots.clock(rates)
     yield Section('clock', 'Images against gyro', _drawings(clock, write))
-    drawn = _drawings(plots.residual_maps(observation), write)
+    maps = _drawings(plots.residual_maps(observation), write)
     tests = _residual_tests(observation, write)
-    residuals = drawn and f'<p>{_RESIDUALS}</p>{drawn}{tests}'
+    residuals = maps and f'<p>{_RESIDUALS}</p>{maps}{tests}'
     yield Section('residuals', 'Residuals', residuals)
     yield Section('calibration', 'Calibration', _calibration(observation, write))
     yield Section('pairs', 'Pairs', _pairs(observation, write))
@@ -158,14 +163,14 @@ _TESTS = (
 )
 
 
-def _residual_tests(observation: Observation, write: _Writer) -> str:
+def _residual_tests(observation: Observation, write: Writer) -> str:
     """The maps of signed residuals as a table; empty without a cell that counts."""
     known = [one for one in observation.maps if one.tested]
     if not known:
         return ''
     rows = ''.join(
-        f'<tr><td>{write.text(one.name)}</td><td class="number">{one.p:.1g}</td>'
-        f'<td>{write.text(one.labels[one.worst])}</td></tr>'
+        f'<tr><td>{write(one.name)}</td><td class="number">{one.p:.1g}</td>'
+        f'<td>{write(one.labels[one.worst])}</td></tr>'
         for one in known
     )
     return (
@@ -174,23 +179,23 @@ def _residual_tests(observation: Observation, write: _Writer) -> str:
     )
 
 
-def _overview(observation: Observation, write: _Writer) -> str:
+def _overview(observation: Observation, write: Writer) -> str:
     """Length, size and rates in one line."""
     parts = []
-    spans = [times.stamps_ns for times in observation.times.values() if len(times.stamps_ns)]
-    if spans:
-        begin, end = min(int(one.min()) for one in spans), max(int(one.max()) for one in spans)
-        parts.append(f'{(end - begin) * 1e-9:.1f} s')
+    stamps = [times.stamps for times in observation.times.values()]
+    if stamps:
+        whole = np.concatenate(stamps)
+        parts.append(f'{int(np.ptp(whole)) * 1e-9:.1f} s')
     parts += [
-        f'{len(times.stamps_ns)} messages ({role.value})'
-        for role, times in observation.times.items()
+        f'{len(times.stamps)} messages ({role.value})' for role, times in observation.times.items()
     ]
-    if observation.intrinsics is not None:
-        parts.append(f'{observation.intrinsics.image_width}x{observation.intrinsics.image_height}')
-    return write.text(', '.join(parts) or 'no messages could be read')
+    camera = observation.intrinsics
+    if camera is not None:
+        parts.append(f'{camera.image_width}x{camera.image_height}')
+    return write(', '.join(parts) or 'no messages could be read')
 
 
-def _cards(observation: Observation, write: _Writer) -> str:
+def _cards(observation: Observation, write: Writer) -> str:
     """The three questions of a reader, each with an answer."""
     faults = [one for one in observation.lines if one.state is FindingState.WRONG]
     doubts = [one for one in observation.lines if one.state is FindingState.SUSPECT]
@@ -209,7 +214,7 @@ def _cards(observation: Observation, write: _Writer) -> str:
         f'<div class="{state}"><h2>Can I use this recording?</h2><p><strong>{usable}</strong></p>'
         f'<p>{_withheld(observation)}</p></div>'
         f'<div class="{"wrong" if faults else state}"><h2>What is wrong?</h2>'
-        f'<p><strong>{wrong}</strong></p><p>{write.text(detail)}</p></div>'
+        f'<p><strong>{wrong}</strong></p><p>{write(detail)}</p></div>'
         f'<div class="{state}"><h2>What do I get?</h2>{_gains(observation, write)}</div></div>'
     )
 
@@ -223,37 +228,48 @@ def _withheld(observation: Observation) -> str:
     )
 
 
-def _gains(observation: Observation, write: _Writer) -> str:
+def _gains(observation: Observation, write: Writer) -> str:
     """Errors against the truth, or sigmas, and the state of the metric path."""
     known = [one for one in observation.pairs if one.pose]
     lines = []
     errors = [one.errors for one in known if one.errors is not None]
     if errors:
-        for name, values in (
-            ('rotation', [one.rotation_error for one in errors]),
-            ('direction of translation', [one.translation_error for one in errors]),
-        ):
-            median, most = median_and_p90(values)
-            lines.append(f'error of the {name}: {median:.2g} deg (median), {most:.2g} deg (90 %)')
+        lines += [
+            _error('rotation', [one.rotation_error for one in errors]),
+            _error('direction of translation', [one.translation_error for one in errors]),
+        ]
     elif known:
         sigmas = [tables.rotation_sigmas(one.pose.covariance) for one in known]
-        rotation = sorted(math.degrees(math.hypot(*one)) for one in sigmas)
-        lines.append(f'rotations to {rotation[len(rotation) // 2]:.2g} deg (1 sigma, median)')
+        sizes = sorted(math.hypot(*one) for one in sigmas)
+        median = math.degrees(sizes[len(sizes) // 2])
+        lines.append(f'rotations to {median:.2g} deg (1 sigma, median)')
     path = observation.path
     if path.path is not None:
         lines.append(f'a metric path, at its end to {path.sigma:.2g} m (1 sigma)')
     elif known:
         lines.append(f'no metric path: {path.reason}')
-    return ''.join(f'<p>{write.text(line)}</p>' for line in lines) or '<p>Nothing yet</p>'
+    return ''.join(f'<p>{write(line)}</p>' for line in lines) or '<p>Nothing yet</p>'
 
 
-def _findings(lines: Sequence[Line], write: _Writer) -> str:
+def _error(name: str, values: Sequence[float]) -> str:
+    """Errors [deg] of the pairs in a line."""
+    median, most = median_and_p90(values)
+    return f'error of the {name}: {median:.2g} deg (median), {most:.2g} deg (90 %)'
+
+
+# The states of findings in the order in which a page has them.
+_ORDER = (FindingState.WRONG, FindingState.SUSPECT, FindingState.UNKNOWN, FindingState.OK)
+
+
+def _findings(lines: Sequence[Line], write: Writer) -> str:
     """Failures and warnings, then the rest, folded."""
-    order = (FindingState.WRONG, FindingState.SUSPECT, FindingState.UNKNOWN, FindingState.OK)
-    ranked = sorted(lines, key=lambda line: order.index(line.state))
-    bad = [line for line in ranked if line.state in order[:2]]
-    rest = [line for line in ranked if line.state not in order[:2]]
-    shown = ''.join(_finding(line, write) for line in bad) or '<p>No failure and no warning.</p>'
+    of_state: dict[FindingState, list[Line]] = {state: [] for state in _ORDER}
+    for line in lines:
+        of_state[line.state].append(line)
+    wrong, suspect, *others = of_state.values()
+    shown = ''.join(_finding(line, write) for line in (*wrong, *suspect))
+    shown = shown or '<p>No failure and no warning.</p>'
+    rest = list(chain.from_iterable(others))
     if not rest:
         return shown
     counts = Counter(line.state.verdict for line in rest)
@@ -262,14 +278,14 @@ def _findings(lines: Sequence[Line], write: _Writer) -> str:
     return f'{shown}<details><summary>The others: {summary}</summary>{folded}</details>'
 
 
-def _finding(line: Line, write: _Writer) -> str:
+def _finding(line: Line, write: Writer) -> str:
     candidates = [code.value for code in line.finding.candidates if code is not line.code]
-    more = f'<p>{write.text(line.fix)}</p>' if line.fix else ''
+    more = f'<p>{write(line.fix)}</p>' if line.fix else ''
     if candidates:
-        more += f'<p class="soft">may also be: {write.text(", ".join(candidates))}</p>'
+        more += f'<p class="soft">may also be: {write(", ".join(candidates))}</p>'
     return (
         f'<div class="finding"><div>{_badge(line.state)}</div><div>'
-        f'<p><strong>{write.text(line.code.value)}</strong>: {write.text(line.message)}</p>'
+        f'<p><strong>{write(line.code.value)}</strong>: {write(line.message)}</p>'
         f'{more}</div></div>'
     )
 
@@ -278,18 +294,18 @@ def _badge(state: FindingState) -> str:
     return f'<span class="badge {state.value}">{state.verdict}</span>'
 
 
-def _drawings(drawings: Sequence[Drawing], write: _Writer) -> str:
+def _drawings(drawings: Sequence[Drawing], write: Writer) -> str:
     """Drawings side by side, each with its caption."""
     if not drawings:
         return ''
     shown = ''.join(
-        f'<div class="plot">{one.svg}<p class="caption">{write.text(one.caption)}</p></div>'
+        f'<div class="plot">{one.svg}<p class="caption">{write(one.caption)}</p></div>'
         for one in drawings
     )
     return f'<div class="drawings">{shown}</div>'
 
 
-def _calibration(observation: Observation, write: _Writer) -> str:
+def _calibration(observation: Observation, write: Writer) -> str:
     """Configured against estimated values, and the calibration of what was not configured."""
     rows = ''.join(_row(one, write) for one in observation.health.findings if one.estimated)
     table = ''
@@ -303,39 +319,41 @@ def _calibration(observation: Observation, write: _Writer) -> str:
         return table
     lines = '\n'.join(calibration.report(found, observation.intrinsics.global_shutter_camera()))
     text = 'Not everything was configured. A calibration of this recording, used for this page:'
-    return f'{table}<p>{text}</p><pre>{write.text(lines)}</pre>'
+    return f'{table}<p>{text}</p><pre>{write(lines)}</pre>'
 
 
-def _row(finding: Finding, write: _Writer) -> str:
+def _row(finding: Finding, write: Writer) -> str:
     configured, estimated = (
         ', '.join(f'{value:.4g}' for value in values)
         for values in (finding.configured, finding.estimated)
     )
     sigma = '' if finding.sigma is None else f' &plusmn; {finding.sigma:.2g}'
-    unit = write.text(finding.unit)
+    unit = write(finding.unit)
     return (
-        f'<tr><td>{write.text(finding.code.value)}</td><td>{_badge(finding.state)}</td>'
+        f'<tr><td>{write(finding.code.value)}</td><td>{_badge(finding.state)}</td>'
         f'<td class="number">{configured} {unit}</td>'
         f'<td class="number">{estimated}{sigma} {unit}</td></tr>'
     )
 
 
-def _pairs(observation: Observation, write: _Writer) -> str:
+def _pairs(observation: Observation, write: Writer) -> str:
     """Numbers of the pairs, reasons of those without a pose, errors and sigmas."""
     if not observation.pairs:
         problem = observation.completion.problem
-        return f'<p>No pair was estimated. {write.text(problem)}</p>'
+        return f'<p>No pair was estimated. {write(problem)}</p>'
     statuses = Counter(one.pose.status.value for one in observation.pairs)
-    reasons = Counter(one.pose.reason for one in observation.pairs if not one.pose)
     text = ', '.join(f'{count} {status}' for status, count in statuses.most_common())
+    reasons = Counter(one.pose.reason for one in observation.pairs if not one.pose)
+    unused = list(observation.unused.items())
     listed = ''.join(
-        f'<li>{write.text(reason)} ({count})</li>'
-        for reason, count in [*reasons.most_common(5), *list(observation.unused.items())[:5]]
+        f'<li>{write(reason)} ({count})</li>'
+        for reason, count in (*reasons.most_common(5), *unused[:5])
     )
+    listing = f'<ul>{listed}</ul>' if listed else ''
+    drawings = _drawings(plots.pairs(observation.pairs), write)
     return (
-        f'<p>{len(observation.pairs)} pairs of {observation.frames} frames: {write.text(text)}.'
-        f'</p>{f"<ul>{listed}</ul>" if listed else ""}'
-        f'{_drawings(plots.pairs(observation.pairs), write)}'
+        f'<p>{len(observation.pairs)} pairs of {observation.frames} frames: {write(text)}.</p>'
+        f'{listing}{drawings}'
     )
 
 
@@ -345,8 +363,10 @@ def _frames(observation: Observation) -> str:
     for number, pair in enumerate(observation.shown):
         if pair.image2 is None:
             continue
-        coded = cv2.imencode('.jpg', draw_pair(pair), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-        source = f'data:image/jpeg;base64,{b64encode(coded.tobytes()).decode()}'
+        quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        _, coded = cv2.imencode('.jpg', draw_pair(pair), quality)
+        text = b64encode(coded.tobytes()).decode()
+        source = f'data:image/jpeg;base64,{text}'
         alt = f'Frame {number + 1} of {len(observation.shown)} with the matches of its pair'
         shown.append(f'<div class="plot"><img alt="{alt}" src="{source}"></div>')
     if not shown:
@@ -358,11 +378,11 @@ def _frames(observation: Observation) -> str:
     return f'<p>{text}</p><div class="drawings">{"".join(shown)}</div>'
 
 
-def _path(observation: Observation, write: _Writer, images: bool) -> str:
+def _path(observation: Observation, write: Writer, images: bool) -> str:
     """The metric path, or why there is none."""
     found = observation.path
     if found.path is None:
-        return f'<p>None: {write.text(found.reason)}.</p>' if observation.pairs else ''
+        return f'<p>None: {write(found.reason)}.</p>' if observation.pairs else ''
     lines = [f'sigma of the last position {found.sigma:.3g} m']
     if errors := found.path.errors:
         lines.append(
@@ -370,4 +390,4 @@ def _path(observation: Observation, write: _Writer, images: bool) -> str:
             f'{100.0 * errors.scale_error:+.2f} %'
         )
     drawings = _drawings(plots.metric_path(observation), write) if images else ''
-    return f'<p>{write.text("; ".join(lines))}</p>{drawings}'
+    return f'<p>{write("; ".join(lines))}</p>{drawings}'

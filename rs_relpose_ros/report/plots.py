@@ -1,10 +1,10 @@
 """Drawings of a report, as SVG that takes its colours from the page, light or dark."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import io
 import math
 import re
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import Role
+from rs_relpose_ros.messages.streams import Timeline
 from rs_relpose_ros.offline.tables import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.report.residuals import Cells, map_of, MatchResiduals, mean_rates, Rates
-from rs_relpose_ros.report.run import Inertial, Observation, Times
+from rs_relpose_ros.report.run import Inertial, Observation
 
 # Width of a drawing [inch]: with its letters of 9 points it is read on a phone of 370 px.
 # [derived: 370 px over 5.2 inch of 72 points leave 8.9 px for a letter of 9 points]
@@ -66,11 +67,8 @@ _STYLE: Any = {
 _GAP = 1.8
 
 
-class Paint(Protocol):
-    """Draws on an empty canvas."""
-
-    def __call__(self, picture: Figure) -> None:
-        """Draw."""
+# Draws on an empty canvas.
+Paint = Callable[[Figure], None]
 
 
 class Drawing(NamedTuple):
@@ -117,12 +115,13 @@ def _axes(picture: Figure, count: int = 1, **options: Any) -> list[Axes]:
 
 def thinned(times: Array, values: Array) -> tuple[Array, Array]:
     """At most `_MOST_POINTS` points of a line (N,), the extremes of each part among them."""
-    parts = _MOST_POINTS // 2
     if len(times) <= _MOST_POINTS:
         return times, values
     keep: set[int] = set()
-    for part in np.array_split(np.arange(len(times)), parts):
-        keep |= {int(part[np.argmin(values[part])]), int(part[np.argmax(values[part])])}
+    for part in np.array_split(np.arange(len(times)), _MOST_POINTS // 2):
+        lowest = part[np.argmin(values[part])]
+        highest = part[np.argmax(values[part])]
+        keep |= {int(lowest), int(highest)}
     order = sorted(keep)
     return times[order], values[order]
 
@@ -133,7 +132,7 @@ def _seconds(stamps_ns: NDArray[np.int64], origin_ns: int) -> Array:
 
 def _origin(observation: Observation) -> int:
     """The median of the first stamps, which a single wild one does not move [ns]."""
-    firsts = [int(np.median(times.stamps_ns[:9])) for times in observation.times.values()]
+    firsts = [int(np.median(times.stamps[:9])) for times in observation.times.values()]
     return min(firsts, default=0)
 
 
@@ -160,8 +159,9 @@ def streams(observation: Observation) -> list[Drawing]:
     def delays(picture: Figure) -> None:
         (axis,) = _axes(picture)
         for times, name, color in present:
-            late = 1e-6 * np.asarray(times.received_ns - times.stamps_ns, dtype=np.float64)
-            at = _seconds(times.received_ns, int(times.received_ns.min()))
+            late = 1e-6 * np.asarray(times.received - times.stamps, dtype=np.float64)
+            first_ns = int(times.received.min())
+            at = _seconds(times.received, first_ns)
             axis.plot(*thinned(at, late), '.', color=color, markersize=2.5, label=name)
         axis.set(xlabel='time of recording [s]', ylabel='recorded after stamp [ms]')
         _legend(axis)
@@ -183,18 +183,19 @@ def streams(observation: Observation) -> list[Drawing]:
     ]
 
 
-def _draw_steps(axis: Axes, times: Times, name: str, color: str, origin_ns: int) -> None:
+def _draw_steps(axis: Axes, times: Timeline, name: str, color: str, origin_ns: int) -> None:
     """Steps of one stream [ms], with the odd ones marked."""
-    in_order = np.argsort(times.received_ns, kind='stable')
-    stamps = times.stamps_ns[in_order]
+    in_order = np.argsort(times.received, kind='stable')
+    stamps = times.stamps[in_order]
     at = _seconds(stamps[1:], origin_ns)
     steps = np.diff(stamps) * 1e-6
     forwards = steps[steps > 0.0]
     usual = float(np.median(forwards)) if len(forwards) else math.nan
     odd = (steps <= 0.0) | (steps > _GAP * usual)
+    even = ~odd
     # A step of hours must not flatten the others.
     bounded = steps.clip(-5.0 * usual, 20.0 * usual)
-    axis.plot(*thinned(at[~odd], steps[~odd]), '.', color=color, markersize=2.5)
+    axis.plot(*thinned(at[even], steps[even]), '.', color=color, markersize=2.5)
     axis.plot(*thinned(at[odd], bounded[odd]), 'x', color=RED)
     axis.set_ylabel(f'{name} [ms]')
     rate = 1e3 / usual
@@ -213,7 +214,8 @@ def _legend(axis: Axes) -> None:
 
 def inertial(observation: Observation) -> list[Drawing]:
     """Rates of the gyro and specific force over time, with rest and saturation."""
-    drawings, origin = [], _origin(observation)
+    drawings = []
+    origin = _origin(observation)
     for name, samples, scale, label in (
         ('gyro', observation.gyro, 180.0 / math.pi, 'rate [deg/s]'),
         ('accelerometer', observation.accelerometer, 1.0, 'specific force [m/s$^2$]'),
@@ -273,21 +275,26 @@ def _rests(gyro: Inertial, origin_ns: int) -> Iterable[tuple[float, float]]:
     if len(gyro.values) < 3:
         return
     at = _seconds(gyro.stamps_ns, origin_ns)
-    steps = np.abs(np.diff(gyro.values, axis=0))
-    from_median = np.linalg.norm(gyro.values[1:] - np.median(gyro.values, axis=0), axis=1)
-    quiet = (steps < _REST_RATE).all(axis=1) & (from_median < 3.0 * _REST_RATE)
-    enclosed = np.concatenate([[False], quiet, [False]])
-    edges = np.flatnonzero(np.diff(enclosed.astype(int)))
+    largest_step = np.abs(np.diff(gyro.values, axis=0)).max(axis=1)
+    median = np.median(gyro.values, axis=0)
+    from_median = np.linalg.norm(gyro.values[1:] - median, axis=1)
+    quiet = (largest_step < _REST_RATE) & (from_median < 3.0 * _REST_RATE)
+    enclosed = np.concatenate([[0], quiet, [0]])
+    edges = np.flatnonzero(np.diff(enclosed))
+    last = len(at) - 1
     for first, after in zip(edges[::2], edges[1::2], strict=True):
-        begin, end = float(at[first]), float(at[min(after, len(at) - 1)])
+        begin = float(at[first])
+        end = float(at[min(after, last)])
         if end - begin >= _REST_LENGTH:
             yield begin, end
 
 
 def rates_of(observation: Observation) -> Rates | None:
     """Rates by images and by gyro as configured; None without a rotation of the images."""
-    rotations, gyro = observation.rotations, observation.gyro
-    sensor, intrinsics = observation.parameters.sensor, observation.intrinsics
+    rotations = observation.rotations
+    gyro = observation.gyro
+    sensor = observation.parameters.sensor
+    intrinsics = observation.intrinsics
     if len(rotations) < 3 or len(gyro.values) < 3 or intrinsics is None or sensor.missing():
         return None
     if not any(len(one.points) for one in observation.residuals):
@@ -296,10 +303,9 @@ def rates_of(observation: Observation) -> Rates | None:
     # Images have the rotation between the rows in which their points lie.
     stamped = {'first': 0.0, 'middle': 0.5, 'last': 1.0}[sensor.stamp_row]
     share = _mean_row(observation.residuals) / intrinsics.image_height - stamped
-    signed = (sensor.readout_time or 0.0) * (
-        -1 if sensor.readout_direction in ('up', 'left') else 1
-    )
-    offset_ns = round(NANOSECONDS * (sensor.time_offset + share * signed))
+    direction = -1 if sensor.readout_direction in ('up', 'left') else 1
+    signed_readout = (sensor.readout_time or 0.0) * direction
+    offset_ns = round(NANOSECONDS * (sensor.time_offset + share * signed_readout))
     return mean_rates(
         [one.stamp_ns + offset_ns for one in rotations],
         [one.interval for one in rotations],
@@ -317,7 +323,8 @@ def _mean_row(pairs: Sequence[MatchResiduals]) -> float:
 
 def clock(rates: Rates) -> list[Drawing]:
     """Images against gyro: rates, correlation over the offset, the best offset over time."""
-    scan, (middles, offsets) = rates.scan(), rates.drift()
+    scan = rates.scan()
+    middles, offsets = rates.drift()
 
     def compared(picture: Figure) -> None:
         axes = _axes(picture, 3)
@@ -401,8 +408,10 @@ def residual_maps(observation: Observation) -> list[Drawing]:
     use = np.isfinite(values)
     if not use.any():
         return []
-    width, height = intrinsics.image_width, intrinsics.image_height
-    across, down = np.linspace(0, width, 17), np.linspace(0, height, 13)
+    width = intrinsics.image_width
+    height = intrinsics.image_height
+    across = np.linspace(0, width, 17)
+    down = np.linspace(0, height, 13)
     rows = points[use, 1]
     maps = (
         (
@@ -432,7 +441,8 @@ def residual_maps(observation: Observation) -> list[Drawing]:
 
 
 def _borders(values: Array, count: int) -> Array:
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     return np.linspace(low, max(high, low + 1e-6), count + 1)
 
 
@@ -444,16 +454,14 @@ def pairs(records: Sequence[PairRecord]) -> list[Drawing]:
     begin_ns = records[0].reference_stamp_ns
     at = np.array([(record.stamp_ns - begin_ns) / NANOSECONDS for record in known])
     series = (
-        ('rotation', 'rotation [deg]', rotation_sigmas, 'rotation_error'),
-        ('direction', 'direction [deg]', translation_sigmas, 'translation_error'),
+        ('rotation [deg]', rotation_sigmas, 'rotation_error'),
+        ('direction [deg]', translation_sigmas, 'translation_error'),
     )
 
     def paint(picture: Figure) -> None:
-        for axis, (_, label, sigmas_of, name) in zip(_axes(picture, 2), series, strict=True):
-            sigmas = [
-                math.degrees(float(np.linalg.norm(sigmas_of(one.pose.covariance))))
-                for one in known
-            ]
+        for axis, (label, sigmas_of, name) in zip(_axes(picture, 2), series, strict=True):
+            lengths = [np.linalg.norm(sigmas_of(one.pose.covariance)) for one in known]
+            sigmas = np.degrees(lengths)
             axis.plot(at, sigmas, '_', color=ORANGE, markersize=7, label='1 sigma, as estimated')
             errors = [
                 math.nan if one.errors is None else getattr(one.errors, name) for one in known
@@ -486,10 +494,12 @@ def metric_path(observation: Observation) -> list[Drawing]:
         for axis in (above, height):
             axis.grid(True, linewidth=0.6)
         if found.truth is not None:
-            above.plot(*found.truth[:, :2].T, color=_INK, linewidth=2.0, label='ground truth')
-            height.plot(at, found.truth[:, 2], color=_INK, linewidth=2.0)
-        above.plot(*found.positions[:, :2].T, color=ORANGE, label='odometry, live')
-        height.plot(at, found.positions[:, 2], color=ORANGE)
+            x, y, z = found.truth.T
+            above.plot(x, y, color=_INK, linewidth=2.0, label='ground truth')
+            height.plot(at, z, color=_INK, linewidth=2.0)
+        x, y, z = found.positions.T
+        above.plot(x, y, color=ORANGE, label='odometry, live')
+        height.plot(at, z, color=ORANGE)
         above.set_aspect('equal', adjustable='datalim')
         above.set(xlabel='x [m]', ylabel='y [m]')
         height.set(xlabel='time [s]', ylabel='z [m]')

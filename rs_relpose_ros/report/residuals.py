@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.calibration.residual_maps import signed_residuals
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.imu.integration import integral, interpolated
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # Fewest matches of a cell of a map: fewer have a mean that is noise. [chosen: 5 to 30 would do]
@@ -74,9 +75,8 @@ def map_of(x: Array, y: Array, residuals: Array, borders: tuple[Array, Array]) -
     bins = list(borders)
     counts, *_ = np.histogram2d(x, y, bins)
     squares, *_ = np.histogram2d(x, y, bins, weights=residuals**2)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        rms = np.sqrt(squares / counts)
-    rms[counts < _FEWEST] = np.nan
+    mean_squares = squares / np.maximum(counts, 1.0)
+    rms = np.where(counts < _FEWEST, np.nan, np.sqrt(mean_squares))
     return Cells(*borders, rms.T)
 
 
@@ -90,12 +90,14 @@ class OffsetScan(NamedTuple):
     def best(self) -> float:
         """Offset of the largest correlation [s], by a parabola through the best three."""
         k = int(np.argmax(self.correlation))
+        offset = self.offsets[k]
         if not 0 < k < len(self.offsets) - 1:
-            return float(self.offsets[k])
+            return float(offset)
         before, at, after = self.correlation[k - 1 : k + 2]
         bend = before - 2.0 * at + after
         shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
-        return float(self.offsets[k] + shift * (self.offsets[1] - self.offsets[0]))
+        step = self.offsets[1] - self.offsets[0]
+        return float(offset + shift * step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,11 +112,10 @@ class Rates:
 
     def by_gyro(self, offset: float = 0.0) -> Array:
         """Mean rates (N, 3) of the gyro over the intervals, moved by an offset [s]."""
-        ends, begins = (
-            np.stack([np.interp(t + offset, self.times, axis) for axis in self.angles.T], axis=1)
-            for t in (self.ends, self.begins)
-        )
-        return (ends - begins) / (self.ends - self.begins)[:, None]
+        at_begins = interpolated(self.begins + offset, self.times, self.angles)
+        at_ends = interpolated(self.ends + offset, self.times, self.angles)
+        lengths = self.ends - self.begins
+        return (at_ends - at_begins) / lengths[:, None]
 
     def part(self, begin: float, end: float) -> Self:
         """The intervals that end in a span [s]."""
@@ -126,8 +127,10 @@ class Rates:
     @property
     def determines_offset(self) -> bool:
         """Whether the camera turns enough to compare."""
-        few = len(self.ends) < _FEWEST_ROTATIONS
-        return not few and math.sqrt(float((self.by_images**2).sum(axis=1).mean())) > _LEAST_RATE
+        if len(self.ends) < _FEWEST_ROTATIONS:
+            return False
+        squares = (self.by_images**2).sum(axis=1)
+        return math.sqrt(float(squares.mean())) > _LEAST_RATE
 
     def scan(self) -> OffsetScan:
         """Correlation over the offset of the changes from one rate to the next, all axes together.
@@ -136,20 +139,23 @@ class Rates:
         """
         offsets = np.arange(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1e-9, _OFFSET_STEP)
         images = np.diff(self.by_images, axis=0)
-        values = []
-        for offset in offsets:
+        values = np.zeros(len(offsets))
+        for k, offset in enumerate(offsets):
             gyro = np.diff(self.by_gyro(offset), axis=0)
             power = float((images**2).sum() * (gyro**2).sum())
-            values.append(float((images * gyro).sum()) / math.sqrt(power) if power > 0.0 else 0.0)
-        return OffsetScan(offsets, np.array(values))
+            if power > 0.0:
+                values[k] = float((images * gyro).sum()) / math.sqrt(power)
+        return OffsetScan(offsets, values)
 
     def drift(self) -> tuple[Array, Array]:
         """Middles of parts of the recording (P,) [s], and their best offsets (P,) [s]."""
         if not len(self.ends):
             return np.empty(0), np.empty(0)
-        first, last = float(self.ends[0]), float(self.ends[-1])
+        first = float(self.ends[0])
+        last = float(self.ends[-1])
         last_begin = max(last - 0.5 * _PART, first)
-        middles, offsets = list[float](), list[float]()
+        middles = []
+        offsets = []
         for begin in np.arange(first, last_begin + 1e-9, _PART):
             part = self.part(begin, begin + _PART)
             if part.determines_offset:
@@ -170,10 +176,9 @@ def mean_rates(
     `rates` (K, 3) [rad/s] are those of the gyro in the frame of the camera. Times of the result
     begin with the first sample of the gyro.
     """
-    origin = int(gyro_ns[0]) if len(gyro_ns) else 0
-    ends = (np.array(stamps_ns, dtype=np.int64) - origin) / NANOSECONDS
+    origin_ns = int(gyro_ns[0]) if len(gyro_ns) else 0
+    ends = (np.array(stamps_ns, dtype=np.int64) - origin_ns) / NANOSECONDS
     lengths = np.array(intervals, dtype=float)
-    times = (np.asarray(gyro_ns, dtype=np.int64) - origin) / NANOSECONDS
-    steps = np.diff(times)[:, None] * 0.5 * (rates[1:] + rates[:-1])
-    angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    times = (np.asarray(gyro_ns, dtype=np.int64) - origin_ns) / NANOSECONDS
+    angles = integral(times, rates)
     return Rates(ends - lengths, ends, by_images / lengths[:, None], times, angles)

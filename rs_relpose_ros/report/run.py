@@ -36,7 +36,7 @@ from rs_relpose_ros.messages.incoming import (
     stamp_ns,
 )
 from rs_relpose_ros.messages.published_pair import PublishedPair
-from rs_relpose_ros.messages.streams import check_timelines
+from rs_relpose_ros.messages.streams import check_timelines, Timeline
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check, check_recording
 from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan
@@ -55,13 +55,6 @@ from rs_relpose_ros.report.residuals import MatchResiduals
 SHOWN_FRAMES = 4
 # Share of the images below which hardly any was used. [chosen: as in `check`]
 _FEW_USED = 0.1
-
-
-class Times(NamedTuple):
-    """Times of the N messages of a stream [ns], in the order of reading."""
-
-    stamps_ns: NDArray[np.int64]
-    received_ns: NDArray[np.int64]
 
 
 class Rotation(NamedTuple):
@@ -93,7 +86,7 @@ class Observation:
 
     bag: str
     names: tuple[str, ...]  # of topics and frames, which a page may have to leave out
-    times: dict[Role, Times]
+    times: dict[Role, Timeline]
     gyro: Inertial
     accelerometer: Inertial
     lines: tuple[Line, ...]
@@ -135,8 +128,11 @@ class _Readings:
     """Stamps and samples of the streams, as they are read."""
 
     def __init__(self) -> None:
+        # Stamps and times of reception.
         self._times: dict[Role, tuple[list[int], list[int]]] = {
-            role: ([], []) for role in (Role.IMAGE, Role.IMU, Role.ACCEL)
+            Role.IMAGE: ([], []),
+            Role.IMU: ([], []),
+            Role.ACCEL: ([], []),
         }
         self._gyro: list[tuple[int, Any]] = []
         self._accelerometer: list[tuple[int, Any]] = []
@@ -165,13 +161,14 @@ class _Readings:
         if sample.linear_acceleration is not None:
             self._accelerometer.append((sample.stamp_ns, sample.linear_acceleration))
 
-    def times(self) -> dict[Role, Times]:
+    def times(self) -> dict[Role, Timeline]:
         """Times of the streams that have messages."""
-        return {
-            role: Times(np.array(stamps, dtype=np.int64), np.array(received, dtype=np.int64))
-            for role, (stamps, received) in self._times.items()
-            if stamps
-        }
+        timelines = {}
+        for role, columns in self._times.items():
+            stamps, received = np.array(columns, dtype=np.int64)
+            if len(stamps):
+                timelines[role] = Timeline(role.value, stamps, received)
+        return timelines
 
     @property
     def gyro(self) -> Inertial:
@@ -185,10 +182,10 @@ class _Readings:
 
 
 def _inertial(samples: list[tuple[int, Any]]) -> Inertial:
-    stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
-    values = np.array([value for _, value in samples], dtype=float).reshape(-1, 3)
-    order = np.argsort(stamps, kind='stable')
-    return Inertial(stamps[order], values[order])
+    in_order = sorted(samples, key=lambda one: one[0])
+    stamps = [stamp for stamp, _ in in_order]
+    values = [value for _, value in in_order]
+    return Inertial(np.array(stamps, dtype=np.int64), np.array(values, dtype=float).reshape(-1, 3))
 
 
 class _Run:
@@ -198,12 +195,11 @@ class _Run:
         self._parameters = parameters
         self.truth = truth
         # Wrong parameters must not hide the pairs that show what is wrong.
-        self._front_end = FrontEnd(
-            parameters.updated({'withhold_when_wrong': False}), offline=True, keep_images=True
-        )
+        unsuppressed = parameters.updated({'withhold_when_wrong': False})
+        self._front_end = FrontEnd(unsuppressed, offline=True, keep_images=True)
         self.intake = Intake(self._front_end.sequencer, parameters)
         self._part = max(images // SHOWN_FRAMES, 1)
-        self._best: dict[int, tuple[tuple[bool, float], PairResult]] = {}
+        self._best: dict[int, PairResult] = {}
         self._rotations: dict[int, Rotation] = {}
         self.records: list[PairRecord] = []
         self.residuals: list[MatchResiduals] = []
@@ -219,13 +215,11 @@ class _Run:
         """Run, and yield each pair as a node would publish it."""
         warm_up(self._parameters.estimator)
         for outcome in outcomes(self._front_end, self.intake, self._noted(source)):
+            if isinstance(outcome, MessageRefused):
+                self.unused.add(str(outcome.error))
+                continue
             if not isinstance(outcome, Frame):
-                reason = (
-                    str(outcome.error)
-                    if isinstance(outcome, MessageRefused)
-                    else unused_reason(outcome)
-                )
-                self.unused.add(reason)
+                self.unused.add(unused_reason(outcome))
                 continue
             self.frames += 1
             if outcome.result is not None:
@@ -244,22 +238,27 @@ class _Run:
     def _kept(self, pair: PairResult) -> PairResult:
         """Keep what the page shows of a pair; the pair as a node publishes it."""
         published = replace(pair, pose=suppressed(pair.pose, pair.health), image2=None)
-        withheld = published.pose.status is Status.WITHHELD
-        self.withheld += withheld
-        self.records.append(PairRecord.of(replace(pair, image2=None), self.truth))
+        self.withheld += published.pose.status is Status.WITHHELD
+        record = PairRecord.of(replace(pair, image2=None), self.truth)
+        self.records.append(record)
         if pair.pose:
-            self.residuals.append(MatchResiduals.of(pair, self._focal_length))
+            residuals = MatchResiduals.of(pair, self._focal_length)
+            self.residuals.append(residuals)
             self._residual_maps.add(pair.residual_sums)
         else:
             self._poseless.add(pair.pose.reason)
         self._note_health(pair.health)
         for stamp, interval, by_images, _ in self._front_end.rotations:
             self._rotations[stamp] = Rotation(stamp, interval, by_images)
-        rank = bool(pair.pose), float(pair.inliers * pair.parallax)
-        part = min(self.frames // self._part, SHOWN_FRAMES - 1)
-        if part not in self._best or rank > self._best[part][0]:
-            self._best[part] = rank, pair
+        self._keep_best(pair)
         return published if self._parameters.pair.withhold_when_wrong else pair
+
+    def _keep_best(self, pair: PairResult) -> None:
+        """Keep the pair for the page if it is the best one of its part of the recording."""
+        part = min(self.frames // self._part, SHOWN_FRAMES - 1)
+        best = self._best.get(part)
+        if best is None or _rank(pair) > _rank(best):
+            self._best[part] = pair
 
     def _note_health(self, health: Assessment) -> None:
         self.health = worst_of(self.health, health)
@@ -273,12 +272,12 @@ class _Run:
     @property
     def shown(self) -> tuple[PairResult, ...]:
         """The pairs with their images that a page shows."""
-        return tuple(pair for _, (_, pair) in sorted(self._best.items(), key=lambda one: one[0]))
+        return tuple(self._best[part] for part in sorted(self._best))
 
     @property
     def rotations(self) -> tuple[Rotation, ...]:
         """All rotations by images, in the order of time."""
-        return tuple(rotation for _, rotation in sorted(self._rotations.items()))
+        return tuple(self._rotations[stamp] for stamp in sorted(self._rotations))
 
     def added_to(self, observation: Observation) -> Observation:
         """The observation with what the run has made."""
@@ -308,6 +307,11 @@ class _Run:
         )
 
 
+def _rank(pair: PairResult) -> tuple[bool, float]:
+    """How well a pair shows what the front end does: with a pose, many matches that move far."""
+    return bool(pair.pose), float(pair.inliers * pair.parallax)
+
+
 def observe(bag: Bag, chosen: Chosen, parameters: Parameters) -> Observation:
     """Read an open bag once, and return all that its report shows.
 
@@ -315,22 +319,26 @@ def observe(bag: Bag, chosen: Chosen, parameters: Parameters) -> Observation:
     Damage of the bag ends the reading; the observation has its reason.
     """
     damage: list[str] = []
-    readings, images = _Readings(), chosen.image.count if chosen.image else 0
+    readings = _Readings()
+    images = chosen.image.count if chosen.image else 0
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     scan = Scan(images, parameters.intrinsics)
     source = _until_damage(bag, chosen, scan, readings, damage)
-    completion, run, path = Completion(parameters), None, MetricPath('not run')
-    if chosen.image is not None and chosen.imu is not None:
-        topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
+    completion = Completion(parameters)
+    run = None
+    path = MetricPath('not run')
+    topics = chosen.sensors
+    if topics is not None:
         completion = _completed(bag, topics, parameters, damage)
         if not completion.parameters.sensor.missing():
-            run = _Run(completion.parameters, images, _truth_of(bag, topics, damage))
+            truth = _truth_of(bag, topics, damage)
+            run = _Run(completion.parameters, images, truth)
             path = _follow(run, source, readings, completion.parameters)
     for _ in source:  # the rest of it without a run
         pass
     lines = check.stream_findings(bag, chosen, parameters, contradiction, scan)
-    if chosen.image is not None and chosen.imu is not None:
-        faults = {one.kind: one for one in check_timelines(bag.timeline, chosen)}
+    if topics is not None:
+        faults = check_timelines(bag.timeline, chosen)
         sample = None if run is None else run.sample(images)
         lines += check.joint_findings(scan, sample, completion, parameters, faults)
     observation = Observation(
@@ -396,20 +404,14 @@ def _follow(
         from rs_relpose_ros.odometry.states import Base
 
         estimator = OdometryEstimator(parameters)
-        live = follow(
-            estimator,
-            ((run.read_ns, PublishedPair.of_result(pair)) for pair in pairs),
-            readings.samples,
-        )
+        published = ((run.read_ns, PublishedPair.of_result(pair)) for pair in pairs)
+        live = follow(estimator, published, readings.samples)
         if not live:
             return MetricPath(estimator.blocking_reason or 'it did not start')
         base = estimator.base or Base()
         covariance = live[-1].pose_covariance[:3, :3]
-        return MetricPath(
-            '',
-            path_of([base.camera(pose) for pose in live], run.truth),
-            float(np.sqrt(np.trace(covariance))),
-        )
+        path = path_of([base.camera(pose) for pose in live], run.truth)
+        return MetricPath('', path, float(np.sqrt(np.trace(covariance))))
     except ImportError:
         return MetricPath("gtsam is not installed: pip install 'rs_relpose_ros[odometry]'")
     except RsRelposeError as error:

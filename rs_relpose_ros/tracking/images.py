@@ -55,16 +55,18 @@ class GrayLevels:
     def gray(self, pixels: NDArray[np.uint16]) -> Image:
         """Gray image (H, W) of the next image."""
         low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
+        filled = high - low
         fewest = _LEAST_FILLED * (self._high - self._low)
         is_outside = low < self._low or high > self._high
-        if is_outside or high - low < fewest > _LEAST_RANGE:
-            spare = _MARGIN * (high - low)
+        is_too_wide = filled < fewest and fewest > _LEAST_RANGE
+        if is_outside or is_too_wide:
+            spare = _MARGIN * filled
             self._low = max(low - spare, 0.0)
             self._high = max(high + spare, self._low + _LEAST_RANGE)
         scale = 255.0 / (self._high - self._low)
-        levels = (pixels - np.float32(self._low)) * np.float32(scale)
-        bounded = np.clip(levels, 0.0, 255.0)
-        return np.asarray(bounded.astype(np.uint8))
+        levels = pixels - np.float32(self._low)
+        levels *= np.float32(scale)
+        return np.clip(levels, 0.0, 255.0).astype(np.uint8)
 
 
 def is_dark(image: Image) -> bool:
@@ -310,15 +312,18 @@ class RawImage:
     def _from_bayer(self, levels: GrayLevels) -> Image:
         if self.height < 3 or self.width < 3:
             raise InputError(f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
+        has_two_bytes = self.encoding.endswith('16')
+        mosaic = levels.gray(self._two_bytes()) if has_two_bytes else self._rows(1)
         pattern = self.encoding.removesuffix('16').removesuffix('8')
-        mosaic = levels.gray(self._two_bytes()) if self.encoding.endswith('16') else self._rows(1)
         return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
 
     def _two_bytes(self) -> NDArray[np.uint16]:
         """Pixels of 16 bits, in the byte order of the message."""
         rows = self._rows(2)
-        orders = ('>u2', '<u2') if self.is_bigendian else ('<u2', '>u2')
-        pixels, swapped = (rows.view(order) for order in orders)
+        pixels = rows.view('<u2')
+        swapped = rows.view('>u2')
+        if self.is_bigendian:
+            pixels, swapped = swapped, pixels
         # Some drivers name the other order.
         if self.width > 2 and _roughness(swapped) < _OTHER_ORDER * _roughness(pixels):
             return swapped

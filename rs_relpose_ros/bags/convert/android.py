@@ -1,7 +1,8 @@
 """Folders of Android loggers: PoseCam, MARS Logger, OpenCamera Sensors; and VideoIMUCapture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 import logging
 import math
 from pathlib import Path
@@ -42,9 +43,6 @@ _logger = logging.getLogger(__name__)
 
 # From the camera of ARCore (x right, y up, z backwards) to the optical frame (x right, y down).
 _GL_FROM_OPTICAL = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
-# A quaternion whose length differs by more from 1 is an error of the file. [chosen: digits of text
-# files give 1e-4; any value from 1e-3 to 1e-1 would do]
-_QUATERNION_TOLERANCE = 1e-2
 
 
 def read_posecam(folder: Path) -> Recording:
@@ -53,7 +51,8 @@ def read_posecam(folder: Path) -> Recording:
     images = []
     for row in poses:
         if row.word('image') == 'saved':
-            number, stamp_ns = row.nanoseconds('frame_index'), row.nanoseconds('timestamp_ns')
+            number = row.nanoseconds('frame_index')
+            stamp_ns = row.nanoseconds('timestamp_ns')
             path = folder / 'frames' / f'{number:06d}_{stamp_ns}.jpg'
             images.append(image_file(stamp_ns, path))
     gyro, accel, bias = _posecam_imu(folder / 'imu.csv')
@@ -94,7 +93,8 @@ def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[Sou
     accel: list[ImuSample] = []
     biases: list[Vector] = []
     for row in read_table(path):
-        stamp_ns, kind = row.nanoseconds('timestamp_ns'), row.word('sensor')
+        stamp_ns = row.nanoseconds('timestamp_ns')
+        kind = row.word('sensor')
         value = row.vector(*'xyz')
         if kind == 'accel':
             accel.append(ImuSample(stamp_ns, None, value))
@@ -115,17 +115,12 @@ def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[Sou
 
 def _truth(poses: list[Row], manifest: Path) -> tuple[TruePose, ...]:
     """Return the longest sequence of tracked poses without a jump, which changes the world."""
-    found = optional_object(manifest).get('pose_jumps')
-    # Next to the list, whose name is not documented, are counts and thresholds.
-    lists = list(found.values()) if isinstance(found, Mapping) else [found]
-    jumps: list[int] = []
-    for jump in (jump for one in lists if isinstance(one, list) for jump in one):
-        stamp = jump.get('timestamp_ns') if isinstance(jump, Mapping) else None
-        if isinstance(stamp, int) and abs(stamp) < 2**63:
-            jumps.append(stamp)
+    jumps = sorted(_jumps(manifest))
     tracked = [row for row in poses if row.word('tracking_state') == 'TRACKING']
-    ends = np.searchsorted([row.nanoseconds('timestamp_ns') for row in tracked], sorted(jumps))
-    longest = max(np.split(np.arange(len(tracked)), ends), key=len)
+    stamps_ns = [row.nanoseconds('timestamp_ns') for row in tracked]
+    ends = np.searchsorted(stamps_ns, jumps)
+    parts = np.split(np.arange(len(tracked)), ends)
+    longest = max(parts, key=len)
     if jumps:
         _logger.warning(
             'ARCore relocalised %d times: only the longest part between, of %d of '
@@ -137,13 +132,24 @@ def _truth(poses: list[Row], manifest: Path) -> tuple[TruePose, ...]:
     return tuple(_pose(tracked[number]) for number in longest)
 
 
+def _jumps(manifest: Path) -> Iterator[int]:
+    """Return the times [ns] at which ARCore has relocalised."""
+    found = optional_object(manifest).get('pose_jumps')
+    # Next to the list, whose name is not documented, are counts and thresholds.
+    values = found.values() if isinstance(found, Mapping) else [found]
+    lists = (value for value in values if isinstance(value, list))
+    for jump in chain.from_iterable(lists):
+        stamp = jump.get('timestamp_ns') if isinstance(jump, Mapping) else None
+        if isinstance(stamp, int) and abs(stamp) < 2**63:
+            yield stamp
+
+
 def _pose(row: Row) -> TruePose:
-    quaternion = [row.real(column) for column in ('qx', 'qy', 'qz', 'qw')]
-    length = math.hypot(*quaternion)
-    if abs(length - 1.0) > _QUATERNION_TOLERANCE:
-        raise row.error(f'the quaternion must have length 1, got {length:.3g}')
-    x, y, z, w = (Rotation.from_quat(quaternion) * _GL_FROM_OPTICAL).as_quat().tolist()
-    return TruePose(row.nanoseconds('timestamp_ns'), row.vector('tx', 'ty', 'tz'), (x, y, z, w))
+    R_world_gl = Rotation.from_quat(row.quaternion('qx', 'qy', 'qz', 'qw'))
+    R_world_cam = R_world_gl * _GL_FROM_OPTICAL
+    x, y, z, w = R_world_cam.as_quat().tolist()
+    position = row.vector('tx', 'ty', 'tz')
+    return TruePose(row.nanoseconds('timestamp_ns'), position, (x, y, z, w))
 
 
 def _intrinsics(path: Path, orientation: int | None) -> list[SourcedValue]:
@@ -153,9 +159,10 @@ def _intrinsics(path: Path, orientation: int | None) -> list[SourcedValue]:
     values: list[Any] = [found.get(name) for name in ('fx', 'fy', 'cx', 'cy')]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f'{path} must have the numbers fx, fy, cx and cy')
-    width, height = found.get('width'), found.get('height')
     fx, fy, cx, cy = map(float, values)
     matrix = fx, fy, cx, cy
+    width = found.get('width')
+    height = found.get('height')
     if isinstance(width, int) and isinstance(height, int) and height > width:
         turns = 1 if orientation is None else turns_back(orientation)
         matrix = sensor_matrix(matrix, (height, width), turns)
@@ -174,9 +181,8 @@ def read_mars(folder: Path) -> Recording:
     video = sensor_video(folder / 'movie.mp4')
     stamps = folder / 'frame_timestamps.txt'
     shift_ns, clock = _clock(folder / 'edge_epochs.txt')
-    stamps_ns = [
-        row.nanoseconds('Frame timestamp[nanosec]') + shift_ns for row in read_table(stamps)
-    ]
+    own_ns = [row.nanoseconds('Frame timestamp[nanosec]') for row in read_table(stamps)]
+    stamps_ns = [stamp + shift_ns for stamp in own_ns]
     rates = [f'g{axis}[rad/s]' for axis in 'xyz']
     forces = [f'a{axis}[m/s^2]' for axis in 'xyz']
     imu = [
@@ -206,14 +212,17 @@ def read_mars(folder: Path) -> Recording:
 
 def _nominal_lens(metadata: list[Row], width: int, height: int) -> list[SourcedValue]:
     """Return the focal length that the phone reports as a parameter; nothing without one."""
-    fx, fy = (float(np.median(reals(metadata, name) or [0.0])) for name in ('fx[px]', 'fy[px]'))
+    fx = float(np.median(reals(metadata, 'fx[px]') or [0.0]))
+    fy = float(np.median(reals(metadata, 'fy[px]') or [0.0]))
     if min(fx, fy) <= 0.0:
         return []
+    cx = (width - 1) / 2.0
+    cy = (height - 1) / 2.0
     source = (
         "A GUESS: the lens's nominal focal length as logged, principal point in the middle, no "
         'distortion.'
     )
-    return [camera_matrix(fx, fy, (width - 1) / 2.0, (height - 1) / 2.0, source)]
+    return [camera_matrix(fx, fy, cx, cy, source)]
 
 
 def _clock(path: Path) -> tuple[int, str]:
@@ -261,9 +270,8 @@ def read_opencamera_sensors(folder: Path) -> Recording:
     stamps_ns = [row.nanoseconds(0) for row in read_rows(stamps, range(1))]
     gyro = [ImuSample(stamp, value, None) for stamp, value in _samples(gyro_path)]
     accel_path = gyro_path.with_name(f'{name}_accel.csv')
-    accel = []
-    if accel_path.is_file():
-        accel = [ImuSample(stamp, None, value) for stamp, value in _samples(accel_path)]
+    forces = _samples(accel_path) if accel_path.is_file() else []
+    accel = [ImuSample(stamp, None, value) for stamp, value in forces]
     details = ': recorded with OpenCamera Sensors'
     images = video.frames(stamps_ns, stamps)
     axes = displayed_axes(video, accel)

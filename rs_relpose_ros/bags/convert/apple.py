@@ -35,6 +35,7 @@ from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.imu.integration import interpolated
 from rs_relpose_ros.messages.incoming import TruePose
 
 # A median length of the acceleration in this range is in multiples of the standard gravity, one in
@@ -43,9 +44,7 @@ from rs_relpose_ros.messages.incoming import TruePose
 _IN_GRAVITIES = (0.6, 1.5)
 # [derived: the same range in m/s^2]
 _IN_METRES = (0.6 * STANDARD_GRAVITY, 1.5 * STANDARD_GRAVITY)
-# A quaternion whose length differs by more from 1 is an error of the file. [chosen: digits of text
-# files give 1e-4; any value from 1e-3 to 1e-1 would do]
-_QUATERNION_TOLERANCE = 1e-2
+
 
 # Row to which the offsets here refer.
 _STAMP_ROW = SourcedValue('stamp_row', 'first', 'Convention of time_offset here.')
@@ -86,18 +85,20 @@ def read_ios_logger(folder: Path) -> Recording:
         for row in headless_rows(folder / 'Gyro.txt', 4)
     ]
     accel = []
-    if (folder / 'Accel.txt').is_file():
-        samples = list(headless_rows(folder / 'Accel.txt', 4))
+    forces_file = folder / 'Accel.txt'
+    if forces_file.is_file():
+        samples = list(headless_rows(forces_file, 4))
         vectors = [row.vector(1, 2, 3) for row in samples]
-        forces = _specific_forces(folder / 'Accel.txt', vectors, -1.0)
+        forces = _specific_forces(forces_file, vectors, -1.0)
         accel = [
             ImuSample(row.seconds_as_nanoseconds(0), None, force)
             for row, force in zip(samples, forces, strict=True)
         ]
     lens = []
     if 5 in rows[0].words:
-        values = np.median([[row.real(k) for k in range(2, 6)] for row in rows], axis=0)
-        matrix = sensor_matrix(values.tolist(), (video.width, video.height), video.turns)
+        of_frames = [[row.real(column) for column in range(2, 6)] for row in rows]
+        median = np.median(of_frames, axis=0).tolist()
+        matrix = sensor_matrix(median, (video.width, video.height), video.turns)
         lens = [camera_matrix(*matrix, "Median of ARKit's intrinsics, no distortion.")]
     details = ': recorded with ios_logger'
     axes = displayed_axes(video, accel)
@@ -144,18 +145,15 @@ def _stray_lens(path: Path, video: Video) -> list[SourcedValue]:
     rows = list(read_rows(path, range(3)))
     if len(rows) != 3:
         raise InputError(f'{path} must have three rows, got {len(rows)}')
-    fx, fy = rows[0].real(0), rows[1].real(1)
-    cx, cy = rows[0].real(2), rows[1].real(2)
-    matrix = sensor_matrix((fx, fy, cx, cy), (video.width, video.height), video.turns)
+    of_x, of_y, _ = rows
+    pinhole = of_x.real(0), of_y.real(1), of_x.real(2), of_y.real(2)
+    matrix = sensor_matrix(pinhole, (video.width, video.height), video.turns)
     return [camera_matrix(*matrix, "ARKit's intrinsics, without distortion.")]
 
 
 def _stray_pose(stamp_ns: int, row: Row) -> TruePose:
-    x, y, z, w = (row.real(column) for column in ('qx', 'qy', 'qz', 'qw'))
-    length = math.hypot(x, y, z, w)
-    if abs(length - 1.0) > _QUATERNION_TOLERANCE:
-        raise row.error(f'the quaternion must have length 1, got {length:.3g}')
-    return TruePose(stamp_ns, row.vector(*'xyz'), (x, y, z, w))
+    quaternion = row.quaternion('qx', 'qy', 'qz', 'qw')
+    return TruePose(stamp_ns, row.vector(*'xyz'), quaternion)
 
 
 # -- Sensor Logger, of iPhones and of Android -----------------------------------------------------
@@ -186,25 +184,30 @@ def read_sensor_logger(folder: Path) -> Recording:
 
 def _sensor_logger_images(folder: Path) -> tuple[Video | None, tuple[RecordedImage, ...]]:
     """Read the only video, or the images; names are times in ms since 1970."""
-    files = [path for path in sorted(folder.iterdir()) if path.stem.isdecimal()]
-    videos = [path for path in files if path.suffix.lower() in ('.mp4', '.mov')]
+    times_ns = {
+        path: int(path.stem) * 1_000_000
+        for path in sorted(folder.iterdir())
+        if path.stem.isdecimal()
+    }
+    videos = [path for path in times_ns if path.suffix.lower() in ('.mp4', '.mov')]
     if len(videos) > 1:
         raise InputError(f'{folder} has {len(videos)} videos: there must be one')
     if videos:
-        video = sensor_video(videos[0])
-        start_ns = int(videos[0].stem) * 1_000_000
-        stamps_ns = [start_ns + time_ns for time_ns in video.times_ns()]
-        return video, video.frames(stamps_ns, videos[0])
-    images = [path for path in files if path.suffix.lower() in ('.jpg', '.jpeg', '.png')]
+        (path,) = videos
+        video = sensor_video(path)
+        stamps_ns = [times_ns[path] + since_ns for since_ns in video.times_ns()]
+        return video, video.frames(stamps_ns, path)
+    images = [path for path in times_ns if path.suffix.lower() in ('.jpg', '.jpeg', '.png')]
     if not images:
         raise MissingInputError(f'{folder} has no video or image that is named by its time in ms')
-    return None, tuple(image_file(int(path.stem) * 1_000_000, path) for path in images)
+    return None, tuple(image_file(times_ns[path], path) for path in images)
 
 
 def _sensor_logger_forces(folder: Path) -> list[ImuSample]:
     """Read specific forces; none if no accelerometer is exported."""
     total = folder / 'TotalAcceleration.csv'
-    without_gravity, gravity = folder / 'Accelerometer.csv', folder / 'Gravity.csv'
+    without_gravity = folder / 'Accelerometer.csv'
+    gravity = folder / 'Gravity.csv'
     metadata = optional_table(folder / 'Metadata.csv')
     known = metadata[0].words if metadata else {}
     standardised = str(known.get('standardisation', '')).lower() == 'true'
@@ -232,13 +235,11 @@ def _sensor_logger_forces(folder: Path) -> list[ImuSample]:
 
 def _sums(rows: Sequence[Row], gravities: Sequence[Row]) -> list[Vector]:
     """Add gravity, which changes slowly and is interpolated, to accelerations without it."""
-    at_ns = np.array([row.nanoseconds('time') for row in rows])
-    gravity_ns = np.array([row.nanoseconds('time') for row in gravities])
     vectors = np.array([row.vector(*'xyz') for row in rows])
     gravity = np.array([row.vector(*'xyz') for row in gravities])
-    start_ns = gravity_ns[0]
-    for axis in range(3):
-        vectors[:, axis] += np.interp(
-            (at_ns - start_ns) * 1e-9, (gravity_ns - start_ns) * 1e-9, gravity[:, axis]
-        )
-    return [(x, y, z) for x, y, z in vectors.tolist()]
+    stamps_ns = np.array([row.nanoseconds('time') for row in rows])
+    gravity_ns = np.array([row.nanoseconds('time') for row in gravities])
+    times = (stamps_ns - gravity_ns[0]) * 1e-9
+    gravity_times = (gravity_ns - gravity_ns[0]) * 1e-9
+    sums = vectors + interpolated(times, gravity_times, gravity)
+    return [(x, y, z) for x, y, z in sums.tolist()]

@@ -32,9 +32,6 @@ from rs_relpose_ros.messages.incoming import TruePose
 _MAX_BYTES = 1 << 20
 # Folders of ground truth below mav0, the most accurate first: all have the pose of the IMU.
 _TRUTH = ('state_groundtruth_estimate0', 'mocap0')
-# A quaternion whose length differs by more from 1 is an error of the file. [chosen: digits of text
-# files give 1e-4; any value from 1e-3 to 1e-1 would do]
-_QUATERNION_TOLERANCE = 1e-2
 
 
 def read_euroc(folder: Path) -> Recording:
@@ -54,7 +51,9 @@ def read_euroc(folder: Path) -> Recording:
     )
     camera_yaml = root / 'cam0' / 'sensor.yaml'
     R_body_imu = _body_axes(root / 'imu0' / 'sensor.yaml')
-    camera, values, T_cam_body = None, list[SourcedValue](), None
+    camera = None
+    values = list[SourcedValue]()
+    T_cam_body = None
     if camera_yaml.is_file():
         camera, values, T_cam_body = _camera(camera_yaml, R_body_imu)
     values += _noise(root / 'imu0' / 'sensor.yaml')
@@ -94,13 +93,15 @@ def _camera(
     names = ('camera_matrix', 'distortion_model', 'distortion_coefficients')
     intrinsics = IntrinsicsConfig(**{name: values[name] for name in names})
     camera = intrinsics.of_image(*found.size).global_shutter_camera()
+    R_cam_body = Rotation.from_quat(values['quat_cam_imu_xyzw']).as_matrix()
     T_cam_body = np.eye(4)
-    T_cam_body[:3, :3] = Rotation.from_quat(values['quat_cam_imu_xyzw']).as_matrix()
+    T_cam_body[:3, :3] = R_cam_body
     T_cam_body[:3, 3] = values['imu_position']
-    quaternion = Rotation.from_matrix(T_cam_body[:3, :3] @ R_body_imu).as_quat()
+    R_cam_imu = Rotation.from_matrix(R_cam_body @ R_body_imu)
+    quaternion = R_cam_imu.as_quat().round(9).tolist()
     source = 'T_BS in cam0/sensor.yaml.'
     parameters = [
-        SourcedValue('quat_cam_imu_xyzw', tuple(quaternion.round(9).tolist()), source),
+        SourcedValue('quat_cam_imu_xyzw', tuple(quaternion), source),
         SourcedValue('imu_position', values['imu_position'], source),
     ]
     return camera, parameters, T_cam_body
@@ -141,14 +142,10 @@ def _truth(root: Path, T_body_cam: Array) -> tuple[TruePose, ...]:
 
 
 def _pose(row: Row, T_body_cam: Array) -> TruePose:
-    wxyz = np.array([row.real(column) for column in range(4, 8)])
-    length = float(np.linalg.norm(wxyz))
-    if abs(length - 1.0) > _QUATERNION_TOLERANCE:
-        raise row.error(f'the quaternion must have length 1, got {length:.3g}')
-    R_world_body = Rotation.from_quat(np.roll(wxyz, -1))
+    R_world_body = Rotation.from_quat(row.quaternion(5, 6, 7, 4))  # w is the first one
     R_body_cam = Rotation.from_matrix(T_body_cam[:3, :3])
-    to_camera = R_world_body.apply(T_body_cam[:3, 3])
-    px, py, pz = (np.array(row.vector(1, 2, 3)) + to_camera).tolist()
     R_world_cam = R_world_body * R_body_cam
+    to_camera = R_world_body.apply(T_body_cam[:3, 3])
+    x, y, z = (np.array(row.vector(1, 2, 3)) + to_camera).tolist()
     qx, qy, qz, qw = R_world_cam.as_quat().tolist()
-    return TruePose(row.nanoseconds(0), (px, py, pz), (qx, qy, qz, qw))
+    return TruePose(row.nanoseconds(0), (x, y, z), (qx, qy, qz, qw))

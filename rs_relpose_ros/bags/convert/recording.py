@@ -110,13 +110,15 @@ class Recording:
                     f'{later.name} is stamped {later.stamp_ns} ns, not after '
                     f'the {earlier.stamp_ns} ns of {earlier.name} before it'
                 )
-        first_ns, last_ns = self.images[0].stamp_ns, self.images[-1].stamp_ns
+        first_ns = self.images[0].stamp_ns
+        last_ns = self.images[-1].stamp_ns
         if first_ns < 0 or last_ns >= END_OF_STAMPS_NS:
             raise InputError(
                 f'the images are stamped from {first_ns} to {last_ns} ns, but stamps of '
                 f'ROS are from 0 to {END_OF_STAMPS_NS} ns'
             )
-        start_ns, end_ns = self.imu[0].stamp_ns, self.imu[-1].stamp_ns
+        start_ns = self.imu[0].stamp_ns
+        end_ns = self.imu[-1].stamp_ns
         if end_ns < first_ns or start_ns > last_ns:
             raise InputError(
                 f'the IMU samples, from {start_ns} to {end_ns} ns, '

@@ -25,6 +25,10 @@ _MAX_LINE = 1 << 16
 
 _Value = TypeVar('_Value', int, float)
 
+# A quaternion whose length differs by more from 1 is an error of the file. [chosen: digits of text
+# files give 1e-4; any value from 1e-3 to 1e-1 would do]
+_QUATERNION_TOLERANCE = 1e-2
+
 
 class Row(NamedTuple):
     """Words of one line of a file, by the name of their column or by its number from 0."""
@@ -52,6 +56,16 @@ class Row(NamedTuple):
         """Return three finite numbers."""
         return self.real(x), self.real(y), self.real(z)
 
+    def quaternion(
+        self, x: str | int, y: str | int, z: str | int, w: str | int
+    ) -> tuple[float, float, float, float]:
+        """Return a rotation as a quaternion of length 1."""
+        quaternion = self.real(x), self.real(y), self.real(z), self.real(w)
+        length = math.hypot(*quaternion)
+        if abs(length - 1.0) > _QUATERNION_TOLERANCE:
+            raise self.error(f'the quaternion must have length 1, got {length:.3g}')
+        return quaternion
+
     def integer(self, column: str | int) -> int:
         """Return an integer with or without a sign."""
         return self._number(column, 'an integer', int, lambda _: True)
@@ -60,16 +74,12 @@ class Row(NamedTuple):
         """Return a stamp [ns] that is written in nanoseconds."""
         return self._number(column, 'a stamp in nanoseconds, an integer', int, _is_stamp)
 
-    def seconds_as_nanoseconds(self, column: str | int, start_ns: int = 0) -> int:
-        """Return a stamp [ns] that is written in decimal seconds since a start.
+    def seconds_as_nanoseconds(self, column: str | int) -> int:
+        """Return a stamp [ns] that is written in decimal seconds.
 
         The stamp is rounded from the decimal number: a float would lose up to 240 ns.
         """
-
-        def convert(text: str) -> int:
-            return start_ns + round(Decimal(text) * NANOSECONDS)
-
-        return self._number(column, 'a stamp in seconds', convert, _is_stamp)
+        return self._number(column, 'a stamp in seconds', _nanoseconds, _is_stamp)
 
     def _number(
         self,
@@ -84,6 +94,10 @@ class Row(NamedTuple):
                 return value
         name = column if isinstance(column, str) else column + 1
         raise self.error(f'column {name} must be {legal}, got {str(text)[:40]!r}')
+
+
+def _nanoseconds(text: str) -> int:
+    return round(Decimal(text) * NANOSECONDS)
 
 
 def _is_stamp(value: int) -> bool:

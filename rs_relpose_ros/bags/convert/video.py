@@ -47,7 +47,8 @@ def read_video(path: Path, lens_profile: Path | None) -> Recording:
     duration_ns = max(times_ns[-1] - times_ns[0], 1)
     rate = (len(video) - 1) * NANOSECONDS / duration_ns
     mode = VideoMode(telemetry.brand, telemetry.model, video.width, video.height, rate)
-    camera, readout = None, telemetry.readout
+    camera = None
+    readout = telemetry.readout
     if lens_profile is not None:
         camera, profile_readout = find_lens_profile(lens_profile, mode)
         readout = readout or profile_readout
@@ -94,7 +95,8 @@ class Video:
             if not container.streams.video:
                 raise InputError(f'{path} has no video stream')
             stream = container.streams.video[0]
-            self.width, self.height = int(stream.width), int(stream.height)
+            self.width = int(stream.width)
+            self.height = int(stream.height)
             self._time_base = stream.time_base
             self.display_rotation = self._display_rotation(container)
             # Frames that an edit list cuts off are decoded, but not displayed.
@@ -226,7 +228,8 @@ def read_telemetry(path: Path, start_ns: int) -> Telemetry:
     parser, tags, samples = _parsed(path)
     _refuse_stabilised(path, tags)
     with_gyro = [sample for sample in samples if sample['gyro'] is not None]
-    brand, model = parser.camera or 'unknown camera', parser.model or 'of unknown model'
+    brand = parser.camera or 'unknown camera'
+    model = parser.model or 'of unknown model'
     if not with_gyro:
         raise MissingInputError(
             f'{path} ({brand} {model}) has no gyro that telemetry-parser reads'
@@ -419,8 +422,10 @@ def _calibration(
 ) -> RollingShutterCamera:
     """Scale the calibration of a profile to the size of the video."""
     try:
-        size, lens = profile['calib_dimension'], profile['fisheye_params']
-        scale_x, scale_y = mode.width / size['w'], mode.height / size['h']
+        size = profile['calib_dimension']
+        lens = profile['fisheye_params']
+        scale_x = mode.width / size['w']
+        scale_y = mode.height / size['h']
         (fx, _, cx), (_, fy, cy), _ = lens['camera_matrix']
         # Pixel centres have integer coordinates.
         camera = RollingShutterCamera(
