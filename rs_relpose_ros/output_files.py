@@ -79,7 +79,8 @@ def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
 
     An OSError names it; that of a full disk does not by itself.
     """
-    part, text = path.with_name(f'{path.name}.part'), 'b' not in mode
+    part = path.with_name(f'{path.name}.part')
+    text = 'b' not in mode
     try:
         with part.open(
             mode,

@@ -53,18 +53,20 @@ def _left(first: Array, second: Array, size: tuple[int, int], axis: int) -> floa
     """Residual of two views over that of one; None for too few points in one of the halves."""
     half = 0.5 * size[axis]
     in_second = first[:, axis] >= half
-    if min(np.count_nonzero(in_second), np.count_nonzero(~in_second)) < _LEAST_POINTS:
+    points = np.count_nonzero(in_second)
+    if min(points, len(first) - points) < _LEAST_POINTS:
         return None
-    motion = second - first
     # A point that crosses the border between the views belongs to neither.
-    same_side = (second[:, axis] >= half) == in_second
-    own = first.copy()
-    own[:, axis] = np.where(in_second, own[:, axis] - half, own[:, axis])
-    sizes = np.array(size, dtype=np.float64)
-    sizes_of_view = sizes.copy()
-    sizes_of_view[axis] = half
-    one = _residual(first[same_side] / sizes, motion[same_side])
-    two = _residual(own[same_side] / sizes_of_view, motion[same_side])
+    stays = (second[:, axis] >= half) == in_second
+    in_image = first[stays]
+    motion = second[stays] - in_image
+    in_view = in_image.copy()
+    in_view[in_second[stays], axis] -= half
+    size_of_image = np.array(size, dtype=np.float64)
+    size_of_view = size_of_image.copy()
+    size_of_view[axis] = half
+    one = _residual(in_image / size_of_image, motion)
+    two = _residual(in_view / size_of_view, motion)
     return two / one
 
 
@@ -73,14 +75,15 @@ def _residual(places: Array, motion: Array) -> float:
     x, y = 2.0 * places.T - 1.0
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     weights = np.ones(len(x))
-    sizes = np.zeros(len(x))
+    scale = _LEAST_SCALE
     for _ in range(_ROUNDS):
         root = np.sqrt(weights)[:, None]
-        solution = np.linalg.lstsq(root * design, root * motion, rcond=None)[0]
+        solution, *_ = np.linalg.lstsq(root * design, root * motion, rcond=None)
         sizes = np.linalg.norm(motion - design @ solution, axis=1)
         scale = max(float(np.median(sizes)), _LEAST_SCALE)
-        weights = np.asarray(cauchy_weight((sizes / scale) ** 2))
-    return max(float(np.median(sizes)), _LEAST_SCALE)
+        squares = (sizes / scale) ** 2
+        weights = np.asarray(cauchy_weight(squares))
+    return scale
 
 
 # -- Stabilised images --------------------------------------------------------------------------
@@ -126,26 +129,23 @@ def gains(images: Array, gyro: Array, interval: float) -> Gains | None:
         return None
     inner = slice(count, -count)
     bands: list[float] = []
-    for of_images, of_gyro in _bands(images[:, :2], gyro[:, :2], count):
-        own, other = of_gyro[inner].ravel(), of_images[inner].ravel()
-        bands.append(_slope(own, other))
+    bands_of_images = _bands(images[:, :2], count)
+    bands_of_gyro = _bands(gyro[:, :2], count)
+    for of_images, of_gyro in zip(bands_of_images, bands_of_gyro, strict=True):
+        own = of_gyro[inner].ravel()
+        other = of_images[inner].ravel()
         if np.sqrt(np.mean(own**2)) < _LEAST_RATE:
             return None
+        bands.append(_slope(own, other))
     return Gains(*bands)
 
 
-def _bands(images: Array, gyro: Array, count: int) -> list[tuple[Array, Array]]:
-    """Rates of images and gyro in the fast and the slow band, without their means."""
+def _bands(rates: Array, count: int) -> tuple[Array, Array]:
+    """Rates (N, C) in the fast and in the slow band, without their means."""
     kernel = np.full(count, 1.0 / count)
-    slow = [
-        np.stack([np.convolve(column, kernel, mode='same') for column in rates.T], axis=1)
-        for rates in (images, gyro)
-    ]
-    of_images, of_gyro = slow
-    return [
-        (images - of_images, gyro - of_gyro),
-        (of_images - of_images.mean(axis=0), of_gyro - of_gyro.mean(axis=0)),
-    ]
+    means = [np.convolve(column, kernel, mode='same') for column in rates.T]
+    slow = np.stack(means, axis=1)
+    return rates - slow, slow - slow.mean(axis=0)
 
 
 def _slope(x: Array, y: Array) -> float:
@@ -153,8 +153,10 @@ def _slope(x: Array, y: Array) -> float:
     weights = np.ones(len(x))
     slope = 0.0
     for _ in range(_ROUNDS):
-        slope = float((weights * x * y).sum() / max((weights * x * x).sum(), _LEAST_RATE_SCALE**2))
+        power = max((weights * x * x).sum(), _LEAST_RATE_SCALE**2)
+        slope = float((weights * x * y).sum() / power)
         off = y - slope * x
         scale = _SCALE * robust_scale(off, _LEAST_RATE_SCALE, 0.0)
-        weights = np.asarray(cauchy_weight((off / scale) ** 2))
+        squares = (off / scale) ** 2
+        weights = np.asarray(cauchy_weight(squares))
     return slope

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration import model
@@ -26,7 +25,7 @@ from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import readout_direction, RollingShutterCamera
 from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
-from rs_relpose_ros.imu.integration import mean_rates
+from rs_relpose_ros.imu.integration import integral, interpolated, mean_rates
 
 # Axes of the camera, for people.
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
@@ -91,25 +90,22 @@ def make_pairs(
     """Pairs `gaps` frames apart; none further apart than `max_interval` times the gap [s]."""
     borders = np.searchsorted(tracks.frames, np.arange(len(tracks) + 1))
     order = np.lexsort((tracks.ids, tracks.frames))
-    ids = tracks.ids[order]
+    ids = np.split(tracks.ids[order], borders[1:-1])  # of each frame
     pairs = []
     for i, j in ((i, i + gap) for gap in gaps for i in range(len(tracks) - gap)):
-        if (tracks.stamps_ns[j] - tracks.stamps_ns[i]) * 1e-9 > (j - i) * max_interval:
+        interval = (tracks.stamps_ns[j] - tracks.stamps_ns[i]) * 1e-9
+        if interval > (j - i) * max_interval:
             continue
-        _, *common = np.intersect1d(
-            ids[borders[i] : borders[i + 1]],
-            ids[borders[j] : borders[j + 1]],
-            assume_unique=True,
-            return_indices=True,
-        )
+        _, *common = np.intersect1d(ids[i], ids[j], assume_unique=True, return_indices=True)
         matches = np.array(common)
-        if matches.shape[1] < selection.min_matches:
+        count = matches.shape[1]
+        if count < selection.min_matches:
             continue
-        if matches.shape[1] > selection.max_matches:
-            matches = matches[
-                :, rng.choice(matches.shape[1], selection.max_matches, replace=False)
-            ]
-        pairs.append(Pair(i, j, order[borders[[[i], [j]]] + matches]))
+        if count > selection.max_matches:
+            drawn = rng.choice(count, selection.max_matches, replace=False)
+            matches = matches[:, drawn]
+        starts = borders[[i, j]]
+        pairs.append(Pair(i, j, order[starts[:, None] + matches]))
     return pairs
 
 
@@ -155,25 +151,33 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     """Evaluate F stamps [ns]; at least two."""
     tracker = FrameIntervals()
     kept = [tracker.add(int(stamp)) for stamp in stamps_ns]
-    median = float(np.median(np.diff(stamps_ns))) / NANOSECONDS
+    steps_ns = np.diff(stamps_ns)
+    median = float(np.median(steps_ns)) / NANOSECONDS
     # As in the node: the first frame has no T, and so none that differs.
-    longer = np.array([0.0, *(np.array(kept[1:]) / NANOSECONDS - median)])
+    longer = np.zeros(len(stamps_ns))
+    longer[1:] = np.array(kept[1:]) / NANOSECONDS - median
     low, high = np.quantile(longer, (0.1, 0.9))
     if high - low <= _VARYING * median:
         return FrameTimes(Varying.NOT, np.zeros(len(stamps_ns)))
-    correlation = correlation_of_steps(np.diff(stamps_ns) / NANOSECONDS / median)
+    correlation = correlation_of_steps(steps_ns / NANOSECONDS / median)
     if correlation > _DISTINCT:
         return FrameTimes(Varying.EXPOSURE, longer)
     if correlation >= -_DISTINCT:
         return FrameTimes(Varying.UNCLEAR, np.zeros(len(stamps_ns)))
-    # A smooth line through the stamps less the stamps: straight near each frame.
     times = (stamps_ns - stamps_ns[0]) / NANOSECONDS
-    numbers = np.cumsum([0.0, *np.maximum(np.rint(np.diff(times) / median), 1.0)])
-    lines = (
-        polyfit(numbers - number, times, 1, w=np.exp(-0.25 * ((numbers - number) / _SMOOTH) ** 2))
-        for number in numbers
-    )
-    return FrameTimes(Varying.JITTER, np.array([line[0] for line in lines]) - times)
+    return FrameTimes(Varying.JITTER, _smoothed(times, median) - times)
+
+
+def _smoothed(times: Array, interval: float) -> Array:
+    """Times (F,) [s] on a smooth line through the stamps, which is straight near each frame."""
+    advances = np.maximum(np.rint(np.diff(times) / interval), 1.0)
+    numbers = np.concatenate([[0.0], np.cumsum(advances)])
+    smooth = np.empty(len(times))
+    for k, number in enumerate(numbers):
+        apart = numbers - number
+        weights = np.exp(-0.25 * (apart / _SMOOTH) ** 2)
+        smooth[k] = polyfit(apart, times, 1, w=weights)[0]
+    return smooth
 
 
 # -- Exposure: the gyro is averaged over it -----------------------------------------------------
@@ -199,18 +203,21 @@ class Exposure(NamedTuple):
     def of(cls, times: Array, stamps: FrameTimes, config: CalibrationConfig) -> Exposure:
         """Of frames at times (F,) [s]: as given, by automatic exposure, or at most an interval."""
         interval = float(np.median(np.diff(times)))
-        margin, follows = config.exposure_margin, stamps.varying is Varying.EXPOSURE
+        follows = stamps.varying is Varying.EXPOSURE
+        margin = config.exposure_margin
         if not margin and follows and not config.exposure_time:
             margin = _MARGIN
         if margin and config.exposed:
             exposure = np.maximum(interval + follows * stamps.covariates - margin, 0.0)
-            doubt = 0.0 if config.exposure_margin else _MARGIN_SIGMA
-            return cls(exposure, 2.0 * doubt * float(np.median(exposure)), margin)
+            margin_sigma = 0.0 if config.exposure_margin else _MARGIN_SIGMA
+            square_sigma = 2.0 * margin_sigma * float(np.median(exposure))
+            return cls(exposure, square_sigma, margin)
         if config.exposure_time or not config.exposed:
             return cls(np.full(len(times), config.exposure_time), 0.0)
         # Evenly distributed between zero and the interval: mean and sigma of the square.
         square = interval**2
-        return cls(np.full(len(times), math.sqrt(square / 3.0)), square * math.sqrt(4.0 / 45.0))
+        exposure = np.full(len(times), math.sqrt(square / 3.0))
+        return cls(exposure, square * math.sqrt(4.0 / 45.0))
 
 
 def exposed_rates(gyro: GyroSeries, exposure: Array) -> tuple[Array, Array]:
@@ -225,20 +232,22 @@ def exposed_rates(gyro: GyroSeries, exposure: Array) -> tuple[Array, Array]:
         return mean_rates(gyro.stamps_ns, gyro.rates, gyro.stamps_ns, np.maximum(widths, 1e-6))
 
     rates = mean(exposure)
-    return rates, (mean(np.sqrt(exposure**2 + _SQUARE)) - rates) / _SQUARE
+    longer = np.sqrt(exposure**2 + _SQUARE)
+    return rates, (mean(longer) - rates) / _SQUARE
 
 
 def noise_density(times: Array, rates: Array) -> float:
     """White noise [rad/s/sqrt(Hz)] of rates (K, 3), by third differences: without motion."""
     steps = np.diff(times)
     step = float(np.median(steps))
-    even = np.abs(steps - step) < 0.2 * step
-    even = even[2:] & even[1:-1] & even[:-2]
-    third = np.abs(np.diff(rates, n=3, axis=0))[even]
-    if len(third) == 0:
+    is_usual = np.abs(steps - step) < 0.2 * step
+    even = is_usual[2:] & is_usual[1:-1] & is_usual[:-2]
+    if not even.any():
         return 0.0
+    third = np.abs(np.diff(rates, n=3, axis=0))
     # 1, -3, 3, -1 of independent samples; the median of a normal deviate's size is 0.6745.
-    return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
+    sigma = np.median(third[even]) / 0.6745 / np.sqrt(20.0)
+    return float(sigma * np.sqrt(step))
 
 
 # Frames further apart than so many intervals have lost some in between.
@@ -299,12 +308,12 @@ class Observations:
         tracks = replace(
             tracks, frames=tracks.frames[ahead], ids=tracks.ids[ahead], points=tracks.points[ahead]
         )
-        times, gyro_times = (
-            np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
-            for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns)
-        )
+        first_ns = tracks.stamps_ns[0]
+        times = np.asarray((tracks.stamps_ns - first_ns) * 1e-9)
+        gyro_times = np.asarray((gyro.stamps_ns - first_ns) * 1e-9)
         stamps = frame_times(tracks.stamps_ns)
         exposure = Exposure.of(times, stamps, config or CalibrationConfig())
+        exposure_of_samples = np.interp(gyro_times, times, exposure.assumed)
         return cls(
             tracks,
             camera,
@@ -314,7 +323,7 @@ class Observations:
             stamps,
             exposure,
             gyro_times,
-            *exposed_rates(gyro, np.interp(gyro_times, times, exposure.assumed)),
+            *exposed_rates(gyro, exposure_of_samples),
             noise_density(gyro_times, gyro.rates),
         )
 
@@ -362,16 +371,21 @@ class Observations:
         inside = (self.gyro_times >= self.times[0]) & (self.gyro_times <= self.times[-1])
         rates = (self.gyro_rates[inside] - bias) @ R_cam_imu.T
         rates = rates - rates.mean(axis=0)
-        values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
-        main, text = vectors[:, 2], ''
-        if np.sqrt(max(values[1], 0.0)) < LEAST_ROTATION:  # two axes fix a rotation
-            first, second, about = (AXES[i] for i in np.argsort(np.abs(main)))
+        moments = rates.T @ rates / len(rates)
+        values, vectors = np.linalg.eigh(moments)
+        main = vectors[:, 2]
+        text = ''
+        rms_of_second = np.sqrt(max(values[1], 0.0))
+        if rms_of_second < LEAST_ROTATION:  # two axes fix a rotation
+            by_share = np.argsort(np.abs(main))
+            first, second, about = (AXES[axis] for axis in by_share)
             text = (
                 f'the camera rotates about one axis only, nearly {about}, so the rotation '
                 f'about it is not observable: rotate about {first} and {second} too, 20 to 60 '
                 'deg/s'
             )
-        return np.sqrt((rates**2).mean(axis=0)), text, main
+        rms = np.sqrt((rates**2).mean(axis=0))
+        return rms, text, main
 
     def pairs(self, selection: PairSelection, rng: np.random.Generator) -> list[Pair]:
         """All pairs of these spans without lost frames."""
@@ -391,13 +405,19 @@ class Observations:
 
         `offset` [s] is about that of the clocks. InputError if there are fewer than ten pairs.
         """
-        pairs, half = self.pairs(selection, rng), 0.5 * self.interval + 0.01
+        pairs = self.pairs(selection, rng)
+        half = 0.5 * self.interval + 0.01
         frames = frames_of(pairs)
-        begin, end = self.gyro_times_of_frames[frames] + offset + [[-half], [half]]
+        first, second = self.gyro_times_of_frames[frames] + offset
+        begin = first - half
+        end = second + half
         clear = (begin >= self.gyro_times[0]) & (end <= self.gyro_times[-1])
         clear &= self.course.clear_of_steps(*self.times[frames])
-        for k in np.flatnonzero(np.diff(self.gyro_times) > MAX_GYRO_GAP):
-            clear &= (end <= self.gyro_times[k]) | (begin >= self.gyro_times[k + 1])
+        gaps = np.flatnonzero(np.diff(self.gyro_times) > MAX_GYRO_GAP)
+        for k in gaps:
+            is_before = end <= self.gyro_times[k]
+            is_after = begin >= self.gyro_times[k + 1]
+            clear &= is_before | is_after
         pairs = list(itertools.compress(pairs, clear))
         if len(pairs) < _LEAST_PAIRS:
             raise InputError(
@@ -407,7 +427,8 @@ class Observations:
             )
         most = min(selection.most_pairs, round(_PAIRS_PER_SECOND * self.times[-1]))
         if len(pairs) > most:
-            pairs = [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, most)]
+            evenly = np.linspace(0, len(pairs) - 1, most)
+            pairs = [pairs[int(k)] for k in evenly]
         return pairs
 
     def measured_rates(self, pairs: Sequence[Pair]) -> MeasuredRates:
@@ -419,9 +440,11 @@ class Observations:
 
     def image_rates(self, pairs: Sequence[Pair]) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame, that rotates the rays of each pair."""
-        rays, times = self.camera.unproject(self.tracks.points), self.times[frames_of(pairs)]
+        rays = self.camera.unproject(self.tracks.points)
+        times1, times2 = self.times[frames_of(pairs)]
         rotations = [rotation_of_rays(*rays[pair.rows]) for pair in pairs]
-        return np.array(rotations).reshape(-1, 3) / (times[1] - times[0])[:, None]
+        intervals = times2 - times1
+        return np.array(rotations).reshape(-1, 3) / intervals[:, None]
 
     def problem(self, pairs: Sequence[Pair], offset: float) -> model.Problem:
         """Data of a fit to `pairs`, which the gyro covers at about this `offset` [s]."""
@@ -537,58 +560,62 @@ def find_starts(
     an axis map.
     """
     rates, begins, ends, gyro_times, gyro_rates = measured_rates
-    turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
+    turned = integral(gyro_times, gyro_rates)
 
     def aligned(offset: float, factors: ArrayLike) -> Start | None:
-        inside = (begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1])
+        begin = begins + offset
+        end = ends + offset
+        inside = (begin >= gyro_times[0]) & (end <= gyro_times[-1])
         # An offset at which the gyro misses most frames cannot be evaluated.
         if inside.sum() < max(10, 0.5 * len(rates)):
             return None
-        begin, end = begins[inside] + offset, ends[inside] + offset
-        measured = _mean_rates(turned, gyro_times, begin, end)
+        measured = _mean_rates(turned, gyro_times, begin[inside], end[inside])
         starts = [
-            _aligned(
-                rates[inside] * [1.0 / factor, 1.0 / factor, 1.0],
-                measured,
-                offset,
-                float(factor),
-                R_prior,
-            )
+            _aligned(rates[inside] * _lens(factor), measured, offset, float(factor), R_prior)
             for factor in np.atleast_1d(factors)
         ]
-        return min(starts, key=lambda start: start.misfit)
+        return min(starts, key=_misfit)
 
     # The best offsets hardly depend on the focal length.
     near = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
     around = np.arange(-_NEAR_DISTANT, _NEAR_DISTANT + 0.5 * _STEP, _STEP)
     offsets = np.concatenate([near, *(offset + around for offset in distant)])
-    starts = [
-        start for offset in offsets if (start := aligned(float(offset), np.median(focal_factors)))
-    ]
+    usual_factor = np.median(focal_factors)
+    starts = (aligned(float(offset), usual_factor) for offset in offsets)
     chosen: list[Start] = []
-    for start in sorted(starts, key=lambda start: start.misfit):
+    for start in sorted(filter(None, starts), key=_misfit):
         if all(abs(start.offset - other.offset) >= 4.0 * _STEP for other in chosen):
             chosen.append(start)
-    return sorted(
-        filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
-        key=lambda start: start.misfit,
-    )
+    refined = (aligned(start.offset, focal_factors) for start in chosen[:3])
+    return sorted(filter(None, refined), key=_misfit)
+
+
+def _misfit(start: Start) -> float:
+    return start.misfit
+
+
+def _lens(focal_factor: float) -> Array:
+    """Factors (3,) of the rates of images with this factor of the assumed focal length."""
+    across = 1.0 / focal_factor
+    return np.array([across, across, 1.0])
 
 
 def rates_at(measured_rates: MeasuredRates, offsets: Array, start: Start) -> RatesAtOffsets:
     """Rates of images and gyro at M offsets (M,) [s], in the axes and the lens of a start."""
     rates, begins, ends, gyro_times, gyro_rates = measured_rates
-    turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
-    lens = np.array([1.0 / start.focal_factor, 1.0 / start.focal_factor, 1.0])
+    turned = integral(gyro_times, gyro_rates)
     order = np.argsort(begins + ends, kind='stable')
-    spans = np.column_stack([begins, ends])[order]
+    begins = begins[order]
+    ends = ends[order]
     gyro = np.full((len(offsets), len(rates), 3), np.nan)
-    for number, offset in enumerate(offsets):
-        begin, end = (spans + offset).T
+    for at_offset, offset in zip(gyro, offsets, strict=True):
+        begin = begins + offset
+        end = ends + offset
         known = (begin >= gyro_times[0]) & (end <= gyro_times[-1])
         means = _mean_rates(turned, gyro_times, begin[known], end[known])
-        gyro[number, known] = means @ start.R_cam_imu.T
-    return RatesAtOffsets(spans.mean(axis=1), offsets, rates[order] * lens, gyro)
+        at_offset[known] = means @ start.R_cam_imu.T
+    images = rates[order] * _lens(start.focal_factor)
+    return RatesAtOffsets(0.5 * (begins + ends), offsets, images, gyro)
 
 
 # Step of the times at which sizes of rates are correlated [s]. A longer one would miss a peak.
@@ -615,12 +642,15 @@ def distant_offsets(measured: MeasuredRates, beyond: float) -> list[float]:
     middles = 0.5 * (measured.begins + measured.ends)
     order = np.argsort(middles)
     middles = middles[order]
-    images = _on_grid(middles, np.linalg.norm(measured.rates[order], axis=1))
-    # The rates of the images are means over about a frame, and so is the gyro here.
-    width = max(round(float(np.median(np.diff(middles))) / _GRID), 1)
+    sizes_of_images = np.linalg.norm(measured.rates[order], axis=1)
+    images = _on_grid(middles, sizes_of_images)
     moving = measured.gyro_rates - np.median(measured.gyro_rates, axis=0)
-    sizes = _on_grid(measured.gyro_times, np.linalg.norm(moving, axis=1))
-    gyro = np.convolve(sizes, np.full(width, 1.0 / width), mode='same')
+    sizes_of_gyro = np.linalg.norm(moving, axis=1)
+    # The rates of the images are means over about a frame, and so is the gyro here.
+    frame = float(np.median(np.diff(middles)))
+    width = max(round(frame / _GRID), 1)
+    mean = np.full(width, 1.0 / width)
+    gyro = np.convolve(_on_grid(measured.gyro_times, sizes_of_gyro), mean, mode='same')
     correlation, covered = _correlation(images, gyro)
     lags = np.arange(len(correlation)) - (len(images) - 1)
     offsets = measured.gyro_times[0] - middles[0] + _GRID * lags
@@ -653,10 +683,13 @@ def _correlation(images: Array, gyro: Array) -> tuple[Array, Array]:
     count = np.maximum(summed(ones_images, ones_gyro), 1.0)
     image_sum = summed(images, ones_gyro)
     gyro_sum = summed(ones_images, gyro)
-    of_images = summed(images**2, ones_gyro) - image_sum**2 / count
-    of_gyro = summed(ones_images, gyro**2) - gyro_sum**2 / count
+    image_power = summed(images**2, ones_gyro) - image_sum**2 / count
+    gyro_power = summed(ones_images, gyro**2) - gyro_sum**2 / count
     product = summed(images, gyro) - image_sum * gyro_sum / count
-    scale = np.sqrt(np.maximum(of_images, 0.0) * np.maximum(of_gyro, 0.0))
+    # Rounding may leave less than nothing.
+    image_power = np.maximum(image_power, 0.0)
+    gyro_power = np.maximum(gyro_power, 0.0)
+    scale = np.sqrt(image_power * gyro_power)
     correlation = product / np.maximum(scale, np.finfo(float).tiny)
     return correlation, count / len(images)
 
@@ -668,8 +701,9 @@ def _on_grid(times: Array, values: Array) -> Array:
 
 def _mean_rates(turned: Array, times: Array, begin: Array, end: Array) -> Array:
     """Mean rates (P, 3) between times (P,) by the angles `turned` (K, 3) at the `times` (K,)."""
-    angles = [np.interp(end, times, axis) - np.interp(begin, times, axis) for axis in turned.T]
-    return np.stack([one / (end - begin) for one in angles], axis=1)
+    angles = interpolated(end, times, turned) - interpolated(begin, times, turned)
+    duration = end - begin
+    return angles / duration[:, None]
 
 
 def _aligned(
@@ -680,17 +714,26 @@ def _aligned(
     start = Start(offset, np.eye(3), focal_factor, 1.0)
     for _ in range(3):
         # A bias and a constant translation drop out with the means.
-        a, b = (rates - rates[kept].mean(axis=0) for rates in (estimated, measured))
-        C = a[kept].T @ b[kept]
-        u, s, vt = np.linalg.svd(C)
-        if s[1] < _ONE_AXIS * s[0]:  # the rotation nearest to a known one
-            nearest = nearest_axis_map(C) if R_prior is None else R_prior
-            tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
-            R = np.asarray(tilt.as_matrix() @ nearest)
-        else:
-            R = so3.aligning_rotation(C)
-        squares = ((a - b @ R.T) ** 2).sum(axis=1)
-        both = float((a[kept] ** 2).sum()) + float((b[kept] ** 2).sum())
-        start = start._replace(R_cam_imu=R, misfit=float(squares[kept].sum()) / max(both, 1e-12))
-        kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
+        images = estimated - estimated[kept].mean(axis=0)
+        gyro = measured - measured[kept].mean(axis=0)
+        R = _common_rotation(images[kept].T @ gyro[kept], R_prior)
+        left = images - gyro @ R.T
+        squares = (left**2).sum(axis=1)
+        power_of_images = float((images[kept] ** 2).sum())
+        power_of_gyro = float((gyro[kept] ** 2).sum())
+        power = max(power_of_images + power_of_gyro, 1e-12)
+        misfit = float(squares[kept].sum()) / power
+        start = start._replace(R_cam_imu=R, misfit=misfit)
+        typical = max(float(np.median(squares)), 1e-10)
+        kept = squares <= 9.0 * typical
     return start
+
+
+def _common_rotation(correlation: Array, R_prior: Array | None) -> Array:
+    """Rotation (3, 3) by ``sum a b^T`` of rates; about one axis only, the nearest to a prior."""
+    u, s, vt = np.linalg.svd(correlation)
+    if s[1] >= _ONE_AXIS * s[0]:
+        return so3.aligning_rotation(correlation)
+    nearest = nearest_axis_map(correlation) if R_prior is None else R_prior
+    tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
+    return np.asarray(tilt.as_matrix() @ nearest)

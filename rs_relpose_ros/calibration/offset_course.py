@@ -169,13 +169,16 @@ def proposed(rates: RatesAtOffsets) -> OffsetCourse:
 def _costs(left: Array, path: NDArray[np.int64]) -> Array:
     """Minus the log-likelihoods (M, P) of the differences (M, P, 3), by their noise on a path."""
     on_path = left[path, np.arange(len(path))]
-    known = on_path[np.isfinite(on_path).all(axis=1)]
+    is_known = np.isfinite(on_path).all(axis=1)
+    known = on_path[is_known]
     mean = np.median(known, axis=0)
-    noise = SIGMA_PER_MEDIAN * float(np.median(np.abs(known - mean)))
-    scaled = (left - mean) / max(noise, _LEAST_NOISE)
+    deviation = float(np.median(np.abs(known - mean)))
+    noise = max(SIGMA_PER_MEDIAN * deviation, _LEAST_NOISE)
+    scaled = (left - mean) / noise
     squares = (scaled**2).sum(axis=2) / _ROBUST**2
+    squares[~np.isfinite(squares)] = np.inf
     # The loss of Geman and McClure, q / (1 + q), which is 1 where nothing is known.
-    losses = 1.0 - 1.0 / (1.0 + np.where(np.isfinite(squares), squares, np.inf))
+    losses = 1.0 - 1.0 / (1.0 + squares)
     return np.asarray(0.5 * _ROBUST**2 / _ALIKE * losses)
 
 
@@ -187,14 +190,16 @@ def _cheapest(costs: Array) -> tuple[NDArray[np.int64], float]:
     stay = np.arange(count)
     for p in range(1, pairs):
         best = int(np.argmin(total))
-        jumps = total > total[best] + _PRICE
+        after_jump = total[best] + _PRICE
+        jumps = total > after_jump
         came[p] = np.where(jumps, best, stay)
-        total = np.where(jumps, total[best] + _PRICE, total) + costs[:, p]
+        total = np.minimum(total, after_jump) + costs[:, p]
     path = np.empty(pairs, dtype=np.int64)
     path[-1] = int(np.argmin(total))
     for p in range(pairs - 1, 0, -1):
         path[p - 1] = came[p, path[p]]
-    return path, float(costs.sum(axis=1).min() - total.min())
+    of_one_offset = costs.sum(axis=1)
+    return path, float(of_one_offset.min() - total.min())
 
 
 def _best_drift(costs: Array, middles: Array) -> tuple[float, float, NDArray[np.int64]]:
@@ -209,13 +214,16 @@ def _best_drift(costs: Array, middles: Array) -> tuple[float, float, NDArray[np.
     for number in range(-most, most + 1):
         if not number:
             continue
-        shifts = np.rint(number * step * since / _INTERVAL).astype(np.int64)
-        starts = np.arange(np.abs(shifts).max(), count - np.abs(shifts).max())
+        drift = number * step
+        shifts = np.rint(drift * since / _INTERVAL).astype(np.int64)
+        largest = np.abs(shifts).max()
+        starts = np.arange(largest, count - largest)
         places = starts[:, None] + shifts
         totals = costs[places, np.arange(pairs)].sum(axis=1)
-        gain = constant - float(totals.min()) - _PRICE
+        cheapest = int(np.argmin(totals))
+        gain = constant - float(totals[cheapest]) - _PRICE
         if gain > best[1]:
-            best = number * step, gain, places[int(np.argmin(totals))]
+            best = drift, gain, places[cheapest]
     return best
 
 
@@ -226,16 +234,18 @@ def _steps(costs: Array, path: NDArray[np.int64], rates: RatesAtOffsets) -> tupl
     middles = rates.middles
     found = []
     for begin, border, end in zip(borders, borders[1:], borders[2:], strict=False):
-        before, after = path[begin], path[border]
+        before = path[begin]
+        after = path[border]
         seconds = float(rates.offsets[after] - rates.offsets[before])
         if abs(seconds) < _SMALLEST:
             continue
-        section = costs[:, begin:end]
-        first, last = _place(section[before] - section[after])
+        differences = costs[before, begin:end] - costs[after, begin:end]
+        first, last = _place(differences)
         # One image more at the begin: the rates are those between images.
         first = max(begin + first - 1, 0)
         last = min(begin + last, len(path) - 1)
-        found.append(OffsetStep(float(middles[first]), float(middles[last]), seconds))
+        step = OffsetStep(float(middles[first]), float(middles[last]), seconds)
+        found.append(step)
     return tuple(found)
 
 

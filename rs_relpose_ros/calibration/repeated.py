@@ -55,12 +55,32 @@ def combined(
     own = _own(fits, lenses, R_first)
     if intervals is not None:
         own = _at_interval(own, intervals[reference] - intervals)
-    free = np.asarray(own.free.any(axis=0))
     between = _between(own)
-    # Normal equations of the parameters and the doubts, whose prior is their sigma of 1.
+    H, gradient, gains = _normal_equations(own, between)
     doubts = own.by_doubt.shape[2]
-    H, gradient = np.zeros((GLOBAL + doubts,) * 2), np.zeros(GLOBAL + doubts)
+    free = np.asarray(own.free.any(axis=0))
+    whole = block_of(np.append(free, np.ones(doubts, dtype=bool)))
+    inverse = np.zeros_like(H)
+    inverse[whole] = np.linalg.inv(H[whole])
+    shares = (inverse @ gains)[:, :GLOBAL]
+    scatters = shares @ (own.scatters + between) @ shares.transpose(0, 2, 1)
+    by_doubt = inverse[:GLOBAL, GLOBAL:]
+    covariance = scatters.sum(axis=0) + by_doubt @ by_doubt.T + between
+    mean = (inverse @ gradient)[:GLOBAL]
+    fit = _moved(fits[reference], mean, R_first, lenses[reference], covariance, free)
+    return Repeated(fit, np.sqrt(np.diag(between)))
+
+
+def _normal_equations(own: _Own, between: Array) -> tuple[Array, Array, list[Array]]:
+    """Hessian, gradient, and the part of each recording in the latter by its parameters.
+
+    The unknowns are the common parameters and the doubts, whose prior is their sigma of 1.
+    """
+    doubts = own.by_doubt.shape[2]
+    size = GLOBAL + doubts
+    H = np.zeros((size, size))
     H[GLOBAL:, GLOBAL:] = np.eye(doubts)
+    gradient = np.zeros(size)
     gains = []
     for value, shape, by_doubt, fitted in zip(
         own.values, own.shapes, own.by_doubt, own.free, strict=True
@@ -69,21 +89,11 @@ def combined(
         block = block_of(fitted)
         weight[block] = np.linalg.inv((shape + between)[block])
         design = np.hstack([np.eye(GLOBAL), by_doubt])
-        gains.append(design.T @ weight)
-        H += gains[-1] @ design
-        gradient += gains[-1] @ value
-    whole = block_of(np.append(free, np.ones(doubts, dtype=bool)))
-    inverse = np.zeros_like(H)
-    inverse[whole] = np.linalg.inv(H[whole])
-    shares = (inverse @ gains)[:, :GLOBAL]
-    scatter = (shares @ (own.scatters + between) @ shares.transpose(0, 2, 1)).sum(axis=0)
-    by_doubt = inverse[:GLOBAL, GLOBAL:]
-    covariance = scatter + by_doubt @ by_doubt.T + between
-    mean = (inverse @ gradient)[:GLOBAL]
-    return Repeated(
-        _moved(fits[reference], mean, R_first, lenses[reference], covariance, free),
-        np.sqrt(np.diag(between)),
-    )
+        gain = design.T @ weight
+        gains.append(gain)
+        H += gain @ design
+        gradient += gain @ value
+    return H, gradient, gains
 
 
 def _own(fits: Sequence[Fit], lenses: Array, R_first: Array) -> _Own:
@@ -93,11 +103,12 @@ def _own(fits: Sequence[Fit], lenses: Array, R_first: Array) -> _Own:
     for value, one in zip(values, fits, strict=True):
         turn = one.unknowns.R_cam_imu @ R_first.T
         value[ROTATION] = log_so3(np.ascontiguousarray(turn))
-    scatters = np.array([one.covariance - one.by_doubt @ one.by_doubt.T for one in fits])
+    scatters = [one.covariance - one.by_doubt @ one.by_doubt.T for one in fits]
+    shapes = map(_shape, fits, scatters)
     return _Own(
         values,
-        scatters,
-        np.array([_shape(one, scatter) for one, scatter in zip(fits, scatters, strict=True)]),
+        np.array(scatters),
+        np.array(list(shapes)),
         np.array([one.by_doubt for one in fits]),
         np.array([one.free for one in fits]),
     )
@@ -106,7 +117,8 @@ def _own(fits: Sequence[Fit], lenses: Array, R_first: Array) -> _Own:
 def _shape(one: Fit, scatter: Array) -> Array:
     """Inverse of the Hessian with the prior, scaled to the variances of the scatter."""
     shape = np.zeros((GLOBAL, GLOBAL))
-    inverse = np.linalg.inv(one.information + one.problem.prior[one.block])
+    information = one.information + one.problem.prior[one.block]
+    inverse = np.linalg.inv(information)
     ratios = np.diag(scatter[one.block]) / np.diag(inverse)
     shape[one.block] = float(np.median(ratios)) * inverse
     return shape
@@ -131,9 +143,12 @@ def _between(own: _Own) -> Array:
     covariances = own.shapes + apart @ apart.transpose(0, 2, 1)
     between = np.zeros((GLOBAL, GLOBAL))
     of_lens = np.arange(GLOBAL) >= model.LENS.start
-    for k in np.flatnonzero(own.free.any(axis=0) & ~of_lens):
+    alone = np.flatnonzero(own.free.any(axis=0) & ~of_lens)
+    for k in alone:
         some = own.free[:, k]
-        between[k, k] = _variance_between(own.values[some, k], covariances[some, k, k])
+        values = own.values[some, k]
+        variances = covariances[some, k, k]
+        between[k, k] = _variance_between(values, variances)
     places = np.flatnonzero(own.free.all(axis=0) & of_lens)
     lens = np.ix_(places, places)
     own_lenses = np.array([covariance[lens] for covariance in covariances])
@@ -167,8 +182,10 @@ def _lens_between(values: Array, covariances: Array) -> Array:
         return np.zeros((0, 0))
     weights = np.linalg.inv(covariances)
     typical = np.linalg.inv(weights.mean(axis=0))
-    off = values - typical @ np.einsum('nij,nj->i', weights, values) / count
-    ratio = float(np.einsum('ni,nij,nj->', off, weights, off)) / ((count - 1) * size)
+    weighted = np.einsum('nij,nj->i', weights, values)
+    off = values - typical @ weighted / count
+    chi_square = float(np.einsum('ni,nij,nj->', off, weights, off))
+    ratio = chi_square / ((count - 1) * size)
     return np.asarray(max(ratio - 1.0, 0.0) * typical)
 
 
@@ -180,6 +197,8 @@ def _variance_between(values: Array, variances: Array) -> float:
     weights = 1.0 / variances
     total = weights.sum()
     mean = weights @ values / total
-    beyond = weights @ (values - mean) ** 2 - (count - 1)
+    chi_square = weights @ (values - mean) ** 2
+    beyond = chi_square - (count - 1)
     scale = total - (weights**2).sum() / total
-    return max(float(beyond / scale), 0.0) * of_few_groups(count) * count / (count - 1)
+    variance = max(float(beyond / scale), 0.0)
+    return variance * of_few_groups(count) * count / (count - 1)

@@ -18,6 +18,7 @@ from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
+from rs_relpose_ros.imu.integration import interpolated
 
 # Number of rays below which no rotation is estimated. Fewer would follow single wrong matches.
 # [chosen: 8 to 20 would do; a rotation needs two]
@@ -74,11 +75,14 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
     finite = np.isfinite(rays1 + rays2).all(axis=1)
     if np.count_nonzero(finite) < LEAST_RAYS:
         return None
-    first, second = rays1[finite], rays2[finite]
+    first = rays1[finite]
+    second = rays2[finite]
     rotation = aligning_rotation(first.T @ second)
     squares = ((first - second @ rotation.T) ** 2).sum(axis=1)
-    weights = cauchy_weight(squares / max(float(np.median(squares)), 1e-12))
-    return log_so3(aligning_rotation((first.T * weights) @ second))
+    typical = max(float(np.median(squares)), 1e-12)
+    weights = cauchy_weight(squares / typical)
+    correlation = (first.T * weights) @ second
+    return log_so3(aligning_rotation(correlation))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,24 +151,22 @@ class RotationSums(LastSeconds):
         offset = None
         if left_of_all > _LEFT_AT_OFFSET and by_gyro > _ENOUGH_FOR_OFFSET:
             offset = _offset_of(ends, intervals, theta, phi)
-        theta, phi = (_without_rate(one, intervals) for one in (theta, phi))
+        theta = _without_rate(theta, intervals)
+        phi = _without_rate(phi, intervals)
         M = theta.T @ phi
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
-        (rotation, trace), (reflection, mirrored) = (
-            (
-                np.ascontiguousarray((U * (1.0, 1.0, sign)) @ Vt),
-                float(singular[0] + singular[1] + sign * singular[2]),
-            )
-            for sign in (handed, -handed)
-        )
+        # The best rotation and the best reflection differ in the least singular value's sign.
+        of_two = singular[0] + singular[1]
+        trace = float(of_two + handed * singular[2])
+        mirrored = float(of_two - handed * singular[2])
         return RotationComparison(
             _left(float(np.trace(M)), theta, phi),
             left_of_all,
             _left(trace, theta, phi),
             _left(mirrored, theta, phi),
-            rotation,
-            reflection,
+            np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt),
+            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
             trace / max(float((phi**2).sum()), _NO_ROTATION),
             by_gyro,
             len(self),
@@ -188,31 +190,35 @@ def _offset_of(ends: Array, intervals: Array, theta: Array, phi: Array) -> float
 
     def left_at(offset: float) -> tuple[float, int]:
         """Share of the images' rotation that the gyro leaves at an offset, and the number used."""
-        begins, stops = ends - intervals + offset, ends + offset
+        begins = ends - intervals + offset
+        stops = ends + offset
         known = (begins >= times[0]) & (stops <= times[-1])
         count = int(np.count_nonzero(known))
         if count < _FEWEST_AT_OFFSET:
             return math.inf, count
-        by_gyro = [
-            np.interp(stops[known], times, axis) - np.interp(begins[known], times, axis)
-            for axis in angles.T
-        ]
-        of_gyro = _without_rate(np.column_stack(by_gyro), intervals[known])
+        at_begins = interpolated(begins[known], times, angles)
+        at_stops = interpolated(stops[known], times, angles)
+        of_gyro = _without_rate(at_stops - at_begins, intervals[known])
         of_images = _without_rate(theta[known], intervals[known])
-        return _left(float((of_images * of_gyro).sum()), of_images, of_gyro), count
+        trace = float((of_images * of_gyro).sum())
+        return _left(trace, of_images, of_gyro), count
 
     offsets = np.arange(-_LARGEST_OFFSET, _LARGEST_OFFSET + 1e-9, _OFFSET_STEP)
-    left, counts = (np.array(column) for column in zip(*map(left_at, offsets), strict=True))
+    left, counts = np.transpose([left_at(offset) for offset in offsets])
     best = int(np.argmin(left))
-    apart = np.abs(offsets - offsets[best]) > _SAME_OFFSET
-    rival = min(float(left[apart].min()), float(left[len(offsets) // 2]))
+    least = float(left[best])
+    best_offset = offsets[best]
+    apart = np.abs(offsets - best_offset) > _SAME_OFFSET
+    none = len(offsets) // 2  # index of the offset 0
+    rival = min(float(left[apart].min()), float(left[none]))
     # Twice the certainty of other causes: the best of many offsets.
     needed = 2.0 * _LOG_LIKELIHOOD / (1.5 * max(counts[best], 1))
-    if left[best] > _LEFT_AT_OFFSET or abs(offsets[best]) < _LEAST_OFFSET:
+    if least > _LEFT_AT_OFFSET or abs(best_offset) < _LEAST_OFFSET:
         return None
-    if rival < math.exp(needed) * max(float(left[best]), 1e-9):
+    if rival < math.exp(needed) * max(least, 1e-9):
         return None
-    return min((float(offsets[best] + fine) for fine in _FINE), key=lambda one: left_at(one)[0])
+    near = [float(offset) for offset in best_offset + _FINE]
+    return min(near, key=lambda offset: left_at(offset)[0])
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:
@@ -245,7 +251,8 @@ class AccelerationSums(LastSeconds):
         super().__init__(MOST_PAIRS, WINDOW_NS)
         # Fault of the samples, the stamp of its first pair, and whether it lasts.
         self._fault: ForceFault | None = None
-        self._fault_ns, self._faulty = 0, False
+        self._fault_ns = 0
+        self._faulty = False
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
         """Note the acceleration of a pair, or the reason why it has none."""

@@ -57,17 +57,27 @@ class Blocks(NamedTuple):
     def of(cls, final: Fit) -> Blocks:
         """The blocks of a fit that have pairs."""
         middles = final.problem.middles
-        begin, end = float(middles.min()), float(middles.max())
+        begin = float(middles.min())
+        end = float(middles.max())
         count = max(round((end - begin) / _BLOCK), 1)
         borders = np.linspace(begin, end, count + 1)
-        numbers = np.clip(np.searchsorted(borders, middles, side='right') - 1, 0, count - 1)
-        size = final.evaluation.score.shape[1]
+        after = np.searchsorted(borders, middles, side='right')
+        numbers = np.clip(after - 1, 0, count - 1)
+        score = final.evaluation.score
+        curvature = bent(final.weights) * final.evaluation.reduced
+        size = score.shape[1]
         scores = np.zeros((count, size))
         curvatures = np.zeros((count, size, size))
-        np.add.at(scores, numbers, final.evaluation.score)
-        np.add.at(curvatures, numbers, bent(final.weights) * final.evaluation.reduced)
+        np.add.at(scores, numbers, score)
+        np.add.at(curvatures, numbers, curvature)
         whole = curvatures.sum(axis=0) + final.problem.prior[final.block]
-        return cls(borders, scores, curvatures, inverse(whole), np.flatnonzero(final.free))
+        places = np.flatnonzero(final.free)
+        return cls(borders, scores, curvatures, inverse(whole), places)
+
+    @property
+    def middles(self) -> Array:
+        """Times (B,) [s]."""
+        return np.asarray(0.5 * (self.borders[1:] + self.borders[:-1]))
 
 
 def trends(final: Fit, drifts: Sequence[int], steps: Sequence[int]) -> list[Trend]:
@@ -79,29 +89,15 @@ def trends(final: Fit, drifts: Sequence[int], steps: Sequence[int]) -> list[Tren
     count = len(blocks.scores)
     if count < _FEWEST:
         return []
-    middles = 0.5 * (blocks.borders[1:] + blocks.borders[:-1])
-    since = middles - middles.mean()
-    numbers = np.arange(count)
-    inner = np.arange(_BESIDE, count - _BESIDE + 1)
-    after = (numbers >= inner[:, None]).astype(float)
-    found = []
-    for place in drifts:
-        if place in blocks.places:
-            values, sigmas = _changes(blocks, place, since[None])
-            ends = float(blocks.borders[0]), float(blocks.borders[-1])
-            found.append(Trend(place, Kind.DRIFT, float(values[0]), float(sigmas[0]), *ends))
-    for place in steps:
-        if place in blocks.places:
-            values, sigmas = _changes(blocks, place, after)
-            found.append(_step(place, values, sigmas, blocks.borders[inner]))
+    found = [_drift(blocks, place) for place in drifts if place in blocks.places]
+    found += [_step(blocks, place) for place in steps if place in blocks.places]
     return sorted(found, key=lambda one: -one.square)
 
 
 def change_at(final: Fit, place: int, border: float) -> tuple[float, float]:
     """Value and sigma of a step of a free parameter at a time [s] of the pairs."""
     blocks = Blocks.of(final)
-    middles = 0.5 * (blocks.borders[1:] + blocks.borders[:-1])
-    after = (middles >= border).astype(float)
+    after = (blocks.middles >= border).astype(float)
     values, sigmas = _changes(blocks, place, after[None])
     return float(values[0]), float(sigmas[0])
 
@@ -113,13 +109,26 @@ _LEAST_SHARE = 1e-4
 _NOT_KNOWN = 9.0
 
 
-def _step(place: int, values: Array, sigmas: Array, borders: Array) -> Trend:
-    """The step at the border (M,) [s] that gains most, with the span where it may be."""
+def _drift(blocks: Blocks, place: int) -> Trend:
+    """The drift of a free parameter over all blocks."""
+    since = blocks.middles - blocks.middles.mean()
+    values, sigmas = _changes(blocks, place, since[None])
+    begin = float(blocks.borders[0])
+    end = float(blocks.borders[-1])
+    return Trend(place, Kind.DRIFT, float(values[0]), float(sigmas[0]), begin, end)
+
+
+def _step(blocks: Blocks, place: int) -> Trend:
+    """The step of a free parameter that gains most, with the span [s] where it may be."""
+    count = len(blocks.scores)
+    inner = np.arange(_BESIDE, count - _BESIDE + 1)
+    after = (np.arange(count) >= inner[:, None]).astype(float)
+    values, sigmas = _changes(blocks, place, after)
     squares = (values / sigmas) ** 2
     best = int(np.argmax(squares))
-    likely = np.flatnonzero(squares >= squares[best] - _NOT_KNOWN)
-    begin = float(borders[likely[0]]) - _BLOCK
-    end = float(borders[likely[-1]]) + _BLOCK
+    likely = inner[squares >= squares[best] - _NOT_KNOWN]
+    begin = float(blocks.borders[likely[0]]) - _BLOCK
+    end = float(blocks.borders[likely[-1]]) + _BLOCK
     return Trend(place, Kind.STEP, float(values[best]), float(sigmas[best]), begin, end)
 
 
@@ -127,15 +136,19 @@ def _changes(blocks: Blocks, place: int, weights: Array) -> tuple[Array, Array]:
     """Values (M,) and sigmas (M,) of a change of one parameter by weights (M, B) of blocks."""
     own = int(np.flatnonzero(blocks.places == place)[0])
     columns = blocks.curvatures[:, :, own]
+    own_scores = blocks.scores[:, own]
     mixed = weights @ columns
     moved = mixed @ blocks.covariance
     of_all = weights**2 @ columns[:, own]
     information = of_all - (moved * mixed).sum(axis=1)
     is_own = information > _LEAST_SHARE * of_all
-    information = np.where(is_own, information, np.maximum(of_all, np.finfo(float).tiny))
-    values = np.where(is_own, -(weights @ blocks.scores[:, own]) / information, 0.0)
+    positive = np.maximum(of_all, np.finfo(float).tiny)
+    information = np.where(is_own, information, positive)
+    optimum = -(weights @ own_scores) / information
+    values = np.where(is_own, optimum, 0.0)
     parts = _parts(blocks, own, weights, moved, values)
-    scatter = of_few_groups(len(blocks.scores)) * (parts**2).sum(axis=1)
+    squares = (parts**2).sum(axis=1)
+    scatter = of_few_groups(len(blocks.scores)) * squares
     sigmas = np.sqrt(np.maximum(scatter, information)) / information
     return values, np.where(is_own, sigmas, np.inf)
 
@@ -143,8 +156,9 @@ def _changes(blocks: Blocks, place: int, weights: Array) -> tuple[Array, Array]:
 def _parts(blocks: Blocks, own: int, weights: Array, moved: Array, values: Array) -> Array:
     """Parts (M, B) of the blocks in the gradient of each change, after it is applied."""
     parts = np.empty_like(weights)
-    for m, (weight, along, value) in enumerate(zip(weights, moved, values, strict=True)):
-        explained = weight[:, None] * blocks.curvatures[:, :, own] - blocks.curvatures @ along
+    columns = blocks.curvatures[:, :, own]
+    for part, weight, along, value in zip(parts, weights, moved, values, strict=True):
+        explained = weight[:, None] * columns - blocks.curvatures @ along
         left = blocks.scores + value * explained
-        parts[m] = weight * left[:, own] - left @ along
+        part[:] = weight * left[:, own] - left @ along
     return parts

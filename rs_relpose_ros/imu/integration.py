@@ -59,8 +59,9 @@ class ImuSlice:
     @property
     def noise_covariance(self) -> Array:
         """Covariance (3, 3) [rad^2] of the error of `rotation` by the gyro's white noise alone."""
+        seconds = (self.stamps_ns - self.stamps_ns[0]) * 1e-9
         rates = np.ascontiguousarray(self.angular_velocities)
-        _, _, noise = _integrate((self.stamps_ns - self.stamps_ns[0]) * 1e-9, rates)
+        _, _, noise = _integrate(seconds, rates)
         return self.noise_density**2 * noise
 
     @cached_property
@@ -119,28 +120,37 @@ def mean_rates(stamps_ns: Stamps, rates: Array, at_ns: Stamps, width: float | Ar
     """
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     steps = np.diff(seconds)[:, None]
-    integral = _integral(steps, rates)
+    turned = integral(seconds, rates)
     slopes = np.diff(rates, axis=0) / steps
+    last = len(steps) - 1
 
     def integral_at(times: Array) -> Array:
-        k = np.searchsorted(seconds, times, side='right') - 1
-        k = np.clip(k, 0, len(steps) - 1)
+        after = np.searchsorted(seconds, times, side='right')
+        k = np.clip(after - 1, 0, last)
         since = (times - seconds[k])[:, None]
         mean_rate = rates[k] + 0.5 * since * slopes[k]
-        return np.asarray(integral[k] + since * mean_rate)
+        return np.asarray(turned[k] + since * mean_rate)
 
     middle = (at_ns - stamps_ns[0]) * 1e-9
     half = 0.5 * width
     begin = np.clip(middle - half, 0.0, seconds[-1])
     end = np.clip(middle + half, 0.0, seconds[-1])
-    turned = integral_at(end) - integral_at(begin)
-    return np.asarray(turned / (end - begin)[:, None])
+    change = integral_at(end) - integral_at(begin)
+    return np.asarray(change / (end - begin)[:, None])
 
 
-def _integral(steps: Array, values: Array) -> Array:
-    """Integral (K, 3) up to each sample of values (K, 3), linear over `steps` (K - 1, 1) [s]."""
-    areas = 0.5 * (values[1:] + values[:-1]) * steps
-    return np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+def integral(times: Array, values: Array) -> Array:
+    """Integral (K, 3) up to each of the `times` (K,) [s] of values (K, 3) that are linear between.
+
+    SciPy has it, in a package whose import would delay the start of a node.
+    """
+    means = 0.5 * (values[1:] + values[:-1])
+    return _summed(means * np.diff(times)[:, None])
+
+
+def _summed(parts: Array) -> Array:
+    """Sums (K, 3) of the parts (K - 1, 3) before each sample."""
+    return np.vstack([np.zeros(3), np.cumsum(parts, axis=0)])
 
 
 @kernel
@@ -200,9 +210,14 @@ def at_common_times(
     if np.array_equal(times1, times2):  # both sensors are in the same messages
         return times1, values1, values2
     times = np.union1d(times1, times2)
-    resampled1 = np.column_stack([np.interp(times, times1, axis) for axis in values1.T])
-    resampled2 = np.column_stack([np.interp(times, times2, axis) for axis in values2.T])
+    resampled1 = interpolated(times, times1, values1)
+    resampled2 = interpolated(times, times2, values2)
     return times, resampled1, resampled2
+
+
+def interpolated(times: Array, knots: Array, values: Array) -> Array:
+    """Values (N, 3) at `times` (N,), linear between the `values` (K, 3) at `knots` (K,)."""
+    return np.column_stack([np.interp(times, knots, column) for column in values.T])
 
 
 def preintegrate(
@@ -225,16 +240,18 @@ def preintegrate(
     steps = np.diff(seconds)
     duration = float(seconds[-1] - seconds[0])
     rotations = integrated_rotations(seconds, rates)
-    once, twice = force_integrals(steps, np.einsum('kij,kj->ki', rotations, forces))
+    turned_forces = np.einsum('kij,kj->ki', rotations, forces)
+    once, twice = force_integrals(seconds, turned_forces)
     beta = once[-1] + duration * gravity
     alpha = twice[-1] + 0.5 * duration**2 * gravity
 
-    by_gravity = np.vstack([0.5 * duration**2 * np.eye(3), duration * np.eye(3)])
+    half_square = duration**2 / 2.0
+    by_gravity = so3.by_axes(np.array([[half_square], [duration]]))
     by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
-    crossed = duration**2 / 2.0
-    of_noise = so3.by_axes(np.array([[duration**3 / 3.0, crossed], [crossed, duration]]))
+    integrals = np.array([[duration**3 / 3.0, half_square], [half_square, duration]])
+    of_noise = so3.by_axes(integrals)
     by_arm = _by_lever_arm(duration, rotations[-1], rates)
     squared_steps = np.einsum('k,kij,klj->il', 1.0 / steps, by_rates, by_rates)
     covariance = config.accel_noise_density**2 * of_noise
@@ -259,13 +276,13 @@ def _by_lever_arm(duration: float, R: Array, rates: Array) -> Array:
     return np.vstack([duration * swing1 + np.eye(3) - R, swing1 - swing2])
 
 
-def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
-    """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
-    steps = steps[:, None]
-    once = _integral(steps, forces)
-    curved = (2.0 * forces[:-1] + forces[1:]) * (steps**2 / 6.0)
-    moved = once[:-1] * steps + curved
-    return once, np.vstack([np.zeros(3), np.cumsum(moved, axis=0)])
+def force_integrals(times: Array, forces: Array) -> tuple[Array, Array]:
+    """Integrals (K, 3), once and twice, of forces (K, 3) that are linear between `times` (K,)."""
+    once = integral(times, forces)
+    steps = np.diff(times)[:, None]
+    weighted = 2.0 * forces[:-1] + forces[1:]
+    curved = weighted * (steps**2 / 6.0)
+    return once, _summed(once[:-1] * steps + curved)
 
 
 # Cross-product matrix of each axis, in a row: ``skew(v) = (v @ _SKEW).reshape(3, 3)``.
@@ -281,7 +298,8 @@ def _error_derivatives(
     middle = seconds[:-1] + 0.5 * steps
     left = seconds[-1] - middle
     half_turns = 0.25 * steps[:, None] * (rates[1:] + rates[:-1])
-    halfway = rotations[:-1] @ Rotation.from_rotvec(half_turns).as_matrix()
+    turned = Rotation.from_rotvec(half_turns).as_matrix()
+    halfway = rotations[:-1] @ turned
     # A bias rotates with the IMU.
     alpha_by_bias = np.einsum('k,kij->ij', left * steps, halfway)
     beta_by_bias = np.einsum('k,kij->ij', steps, halfway)
@@ -291,10 +309,10 @@ def _error_derivatives(
     halfway_twice = 0.5 * (twice[1:] + twice[:-1])
     later = once[-1] - halfway_once
     later_way = twice[-1] - halfway_twice - halfway_once * left[:, None]
-    alpha_by_rotation = (later_way @ _SKEW).reshape(-1, 3, 3)
-    beta_by_rotation = (later @ _SKEW).reshape(-1, 3, 3)
-    by_rotation = -np.hstack([alpha_by_rotation, beta_by_rotation])
-    return by_bias, by_rotation @ halfway * steps[:, None, None]
+    crosses = np.hstack([later_way @ _SKEW, later @ _SKEW])
+    by_rotation = -crosses.reshape(-1, 6, 3)
+    by_rate = by_rotation @ halfway
+    return by_bias, by_rate * steps[:, None, None]
 
 
 def inertial_motion(
@@ -339,7 +357,8 @@ def motions_on_the_way(
         return [None] * len(frames)
     seconds, rates, forces = since.at_common_times()
     rotations = integrated_rotations(seconds, rates)
-    once, twice = force_integrals(np.diff(seconds), np.einsum('kij,kj->ki', rotations, forces))
+    turned_forces = np.einsum('kij,kj->ki', rotations, forces)
+    once, twice = force_integrals(seconds, turned_forces)
     gravity = np.asarray(whole.acceleration1) - first.force
 
     def up_to(frame: FrameImu) -> InertialMotion | None:
@@ -347,7 +366,8 @@ def motions_on_the_way(
             return None
         duration = seconds_between(first.reference_ns, frame.reference_ns)
         # The stamped rows of all frames are samples of the slice.
-        k = int(np.argmin(np.abs(seconds - seconds[0] - duration)))
+        apart = np.abs(seconds - seconds[0] - duration)
+        k = int(np.argmin(apart))
         return validate.replaced(
             whole,
             alpha=twice[k] + 0.5 * duration**2 * gravity,
