@@ -27,7 +27,7 @@ from rs_relpose_ros.calibration.findings import (
 )
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.estimator.covariance import ImageInformation, IMAGES
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.published_pair import PublishedPair
@@ -54,7 +54,7 @@ from rs_relpose_ros.odometry.pair import (
     Mount,
     without_far_velocities,
 )
-from rs_relpose_ros.odometry.publication import Stamp
+from rs_relpose_ros.odometry.publication import Stamp, untested_scale
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, Notice, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -506,6 +506,30 @@ def test_the_base_starts_at_the_origin_with_x_forward(of_base):
     assert abs(math.atan2(start.R[1, 0], start.R[0, 0])) < 0.01
 
 
+def test_stamps_follow_the_offset_that_the_graph_has_learned(of_base):
+    estimator = of_base[0]
+    publication = estimator._publication(estimator._run)
+    unknown, state = estimator._doubts, estimator._run.graph.newest
+    doubts = np.zeros(unknown.size)
+    before = publication.state(replace(state, doubts=doubts), np.zeros(3), Stamp(0, 0, 0, 0))
+    offset = IMAGES.part('time_offset').start
+    doubts[unknown.images.start + list(unknown.active).index(offset)] = 0.004
+    after = publication.state(replace(state, doubts=doubts), np.zeros(3), Stamp(0, 0, 0, 0))
+    assert (before.stamp_ns, after.stamp_ns) == (0, -4_000_000)  # rows are read 4 ms later
+    assert before.imu_ns == after.imu_ns == 0
+
+
+@pytest.mark.parametrize('pairs', [5, 20, 200])
+def test_a_covariance_of_uncertain_size_holds_its_promise(pairs):
+    """Errors by a variance that so many samples show are beyond 3 sigma as often as known ones."""
+    rng = np.random.default_rng(pairs)
+    errors = (rng.standard_normal((200_000, 3)) ** 2).sum(axis=1)
+    variances = rng.chisquare(pairs, 200_000) / pairs
+    bound = 13.93  # chi squared of 3 degrees of freedom, 99.7 %
+    beyond = (errors / (variances * untested_scale(pairs)) > bound).mean()
+    assert 0.002 < beyond < 0.004
+
+
 def test_covariances_of_the_base_are_those_of_samples(of_base):
     """The body's state is drawn from its covariance; that of the gyro's noise is left out."""
     estimator = of_base[0]
@@ -518,8 +542,10 @@ def test_covariances_of_the_base_are_those_of_samples(of_base):
     more[:3] = more[noiseless._doubts.gyro_matrix] = 0.02**2
     P = state.covariance + np.diag([*[0.0] * 12, *[1e-2**2] * 3, *more])
 
+    publication = noiseless._publication(run_)._replace(scale=1.0)
+
     def odometry(state):
-        return noiseless._publication(run_).state(state, rate, Stamp(0, 0, 0, 0))
+        return publication.state(state, rate, Stamp(0, 0, 0, 0))
 
     published = odometry(replace(state, covariance=P))
     poses, twists = [], []

@@ -47,7 +47,12 @@ from rs_relpose_ros.odometry.pair import (
     row_ns,
     without_far_velocities,
 )
-from rs_relpose_ros.odometry.publication import at_unknown_time, Publication, Stamp
+from rs_relpose_ros.odometry.publication import (
+    at_unknown_time,
+    Publication,
+    Stamp,
+    untested_scale,
+)
 from rs_relpose_ros.odometry.starts import (
     continued,
     end_of,
@@ -160,6 +165,8 @@ class _Run:
     # Intervals of recent pairs [s].
     intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_RECENT))
     pairs: int = 0  # used
+    # Pairs that have tested rig and noises against each other, also on the path it continues.
+    tested: int = 0
     largest: float = 0.0  # innovation before the start
     contradicting: int = 0  # not used
     confirmed: int = 0  # since the start, by so many pairs in motion
@@ -629,6 +636,7 @@ class OdometryEstimator:
             return
         self._doubts_clocks = False
         run.observed_ns, run.pairs = at_ns, run.pairs + 1
+        run.tested += 1
         run.largest = max(run.largest, innovation)
         run.confirmed += run.published and pair.has_direction
         run.variances = place_variances(run.graph.newest)
@@ -753,6 +761,7 @@ class OdometryEstimator:
             observed_ns=pair.reference_imu_ns,
             stamps=deque([first], maxlen=None if self._keep else 1),
             frame_id=self.base.frame_id or pair.frame_id,
+            tested=self._last_run.tested if end is not None and self._last_run else 0,
         )
 
     def _start(
@@ -946,6 +955,7 @@ class OdometryEstimator:
             run.path_end,
             self._doubts,
             self._imu.gyro_noise_density,
+            untested_scale(run.tested),
         )
 
     def _stamp(self, run: _Run, stamp_ns: int, imu_ns: int) -> Stamp:

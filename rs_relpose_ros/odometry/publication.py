@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import fdtri, gammaincinv
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
 from rs_relpose_ros.odometry.graph import (
     ARM,
@@ -22,6 +24,11 @@ from rs_relpose_ros.odometry.graph import (
 from rs_relpose_ros.odometry.starts import PathEnd
 from rs_relpose_ros.odometry.states import Base, Odometry
 
+# Share of errors that `untested_scale` keeps within 3 sigma. A smaller one would leave the tail of
+# the distribution out. [derived: as `beyond` of summary.json counts]
+_WITHIN = 0.997
+# Number of values whose error has one covariance. [derived: of a position or a rotation]
+_COMPARED = 3
 # Noise of a single sample of the gyro in units of its density [sqrt(Hz)]. A smaller one would make
 # published rates too certain. [derived: bandwidth of 100 Hz]
 _RATE_NOISE = 10.0
@@ -30,10 +37,22 @@ _RATE_NOISE = 10.0
 class Stamp(NamedTuple):
     """When and on which path a state is."""
 
-    stamp_ns: int  # on the clock of the camera
+    stamp_ns: int  # on the clock of the camera, by the configured offset
     imu_ns: int
     path: int  # number of earlier starts
     corrections: int  # of the keyframe, since the first start
+
+
+def untested_scale(pairs: int) -> float:
+    """Factor of a covariance whose own size is known from so many pairs.
+
+    Models and noises that the pairs have not tested yet may be wrong: errors by a covariance of
+    uncertain size have the distribution F instead of chi squared, whose bound is further out.
+    """
+    if not pairs:
+        return 1.0
+    bound = 2.0 * gammaincinv(0.5 * _COMPARED, _WITHIN)
+    return float(_COMPARED * fdtri(_COMPARED, pairs, _WITHIN) / bound)
 
 
 def at_unknown_time(state: Odometry, acceleration: Array, rates: Array, sigma: float) -> Odometry:
@@ -65,6 +84,7 @@ class Publication(NamedTuple):
     path_end: PathEnd  # of the path before
     unknown: Doubts
     gyro_noise_density: float
+    scale: float  # of covariances, by what pairs have tested: `untested_scale`
 
     def state(self, body: KeyframeState, gyro: Array, stamp: Stamp) -> Odometry:
         """The base at a state of the body; `gyro` (3,): the rate that it measures."""
@@ -85,11 +105,14 @@ class Publication(NamedTuple):
         columns = slice(DOUBTS.start + matrix.start, DOUBTS.start + matrix.stop)
         to_twist[:, columns] -= to_twist[:, GYRO_BIAS] @ by_matrix
         by_rate = to_twist[:, GYRO_BIAS] * self.gyro_noise_density * _RATE_NOISE
-        of_body = to_world @ body.covariance @ to_world.T
-        of_twist = to_twist @ body.covariance @ to_twist.T
+        covariance = self.scale * body.covariance
+        of_body = to_world @ covariance @ to_world.T
+        of_twist = to_twist @ covariance @ to_twist.T
         inherited = self.path_end.of_pose(body.position + body.R @ arm)
+        # The rows of images are read later than configured by what the graph has learned.
+        _, delay = self.unknown.mount(body.doubts)
         return Odometry(
-            stamp_ns=stamp.stamp_ns,
+            stamp_ns=stamp.stamp_ns - to_nanoseconds(delay),
             imu_ns=stamp.imu_ns,
             frame_id=self.frame_id,
             path=stamp.path,
