@@ -6,6 +6,7 @@ from itertools import pairwise
 import json
 import math
 from pathlib import Path
+import re
 import struct
 from typing import Any
 import zlib
@@ -405,6 +406,22 @@ def test_a_binning_that_the_camera_matrix_has_counted_already(caplog):
         build.rosbags_types, width=1280, height=960, k=central(1280, 960), binning=(2, 2)
     )
     assert intrinsics_from_info(right).binning_x == 2
+
+
+@pytest.mark.parametrize('factor', [0.5, 2.0, 1.5, 0.66])
+def test_a_matrix_of_another_resolution_is_refused_by_that_name(factor):
+    scaled = build.camera_info(build.rosbags_types, k=central(640 * factor, 480 * factor))
+    with pytest.raises(InputError, match='that of another resolution') as error:
+        intrinsics_from_info(scaled)
+    named = re.search(r'about ([\d.]+) times', str(error.value))
+    assert float(named[1]) == pytest.approx(factor, rel=0.05)
+
+
+@pytest.mark.parametrize(('cx', 'cy'), [(319.5 - 100.0, 239.5), (380.0, 290.0), (470.0, 180.0)])
+def test_a_principal_point_off_the_centre_is_of_this_resolution(cx, cy):
+    """Images that were cropped at one side, or a lens that is not centred."""
+    k = (450.0, 0.0, cx, 0.0, 450.0, cy, 0.0, 0.0, 1.0)
+    assert intrinsics_from_info(build.camera_info(build.rosbags_types, k=k)).cx == cx
 
 
 def test_a_region_that_the_size_has_counted_already(caplog):

@@ -41,6 +41,15 @@ _TILTED = 14
 # matrix that belongs to the image. The contradiction shows if only one of two meanings fulfils
 # it. [chosen: real cameras have less than 0.1, and at a binning of 2 the wrong meaning has 0.25]
 _OFF_CENTRE = 0.2
+# Distance of both coordinates of a principal point from the centre, as a share of the side, from
+# which a matrix is that of another resolution. A larger one misses factors below 1.5, a smaller
+# one refuses cameras whose lens is not centred. [chosen: real cameras have less than 0.1, a factor
+# of 1.33 has 0.17]
+_OTHER_RESOLUTION = 0.15
+# Largest difference of the two ratios of such a principal point and the sides, relative to them.
+# A larger one refuses images that were cropped at two sides. [chosen: twice what an off-centre
+# lens of 0.05 of the side makes of equal ones]
+_SAME_FACTOR = 0.2
 
 
 Warn = Callable[[str], object]
@@ -117,6 +126,10 @@ def _part_of_sensor(msg: Any, cx: float, cy: float, warn: Warn) -> dict[str, int
         )
         width, height = roi_width, roi_height = binned
         binning_x = binning_y = 1
+    elif whole:
+        _refuse_other_resolution(
+            cx / width, cy / height, f'{width}x{height}', f'{cx:.1f}, {cy:.1f}'
+        )
     return {
         'width': width,
         'height': height,
@@ -127,6 +140,20 @@ def _part_of_sensor(msg: Any, cx: float, cy: float, warn: Warn) -> dict[str, int
         'image_width': roi_width // binning_x,
         'image_height': roi_height // binning_y,
     }
+
+
+def _refuse_other_resolution(x: float, y: float, size: str, centre: str) -> None:
+    """InputError for a principal point at shares (x, y) of the sides that one factor explains."""
+    mean = 0.5 * (x + y)
+    least = min(abs(x - 0.5), abs(y - 0.5))
+    if least < _OTHER_RESOLUTION or abs(x - y) > _SAME_FACTOR * mean:
+        return
+    raise InputError(
+        f'the camera matrix of CameraInfo is that of another resolution: its principal point '
+        f'({centre}) is that of images about {2.0 * mean:.2g} times as large as {size}; have the '
+        'driver publish the CameraInfo of this resolution, or give camera_matrix; of a cropped '
+        'image, set roi'
+    )
 
 
 def _is_central(centre: float, size: int) -> bool:
