@@ -59,17 +59,20 @@ docs: $(docs_stamp)
 
 # The kernels, which need nothing of ROS, are compiled meanwhile. A failure there is reported by the
 # last step, which does what is left.
-# Removed, a fifth of the environment: the libraries' own tests, GTSAM's data sets, headers, two of
-# three copies of Fast DDS, which are links outside a wheel, pytest, which GTSAM asks for and does not
-# import, and the symbol table of LLVM. Copies of one library in several wheels become links. Files
-# are replaced and not changed: the compilation uses them.
-llvm = $(VENV)/lib/python3*/site-packages/llvmlite/binding/libllvmlite.so
+# Removed, a quarter of the environment: the libraries' own tests, GTSAM's data sets, headers, sources
+# in C and files for CMake, two of three copies of Fast DDS, which are links outside a wheel, pytest,
+# which GTSAM asks for and does not import, and symbol tables of modules that have no libraries of
+# their own (in the others auditwheel has moved sections, which strip may not expect). Copies of one
+# library in several wheels become links. Files are replaced and not changed: the compilation uses them.
+packages := $(VENV)/lib/python3*/site-packages
+stripped = $(packages)/llvmlite $(packages)/numba $(packages)/fontTools $(packages)/kiwisolver \
+    $(packages)/lz4 $(packages)/yaml
 $(stamp): export PYTHONDONTWRITEBYTECODE :=
 $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py setup.cfg \
     package.xml rs_relpose_lab/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
-	@echo 'Setting up $(VENV): a minute or two and 0.75 GB.'
+	@echo 'Setting up $(VENV): a minute or two and 0.7 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	grep -v -e '^#' -e '^ros-' requirements/base.txt | \
 	    xargs $(pip) install --no-compile $(CONSTRAINTS:%=-c %)
@@ -77,16 +80,20 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 	$(pip) install --no-compile -r requirements/demo.txt $(CONSTRAINTS:%=-c %) && \
 	find $(VENV)/lib -type d '(' -name tests -o -name gtsam_unstable -o -path '*/gtsam/Data' ')' \
 	    -prune -exec rm -rf {} + && \
-	rm -rf $(VENV)/include && \
+	find $(VENV)/lib -type f '(' -name '*.[ach]' -o -name '*.pyx' ')' -delete && \
+	rm -rf $(VENV)/include $(VENV)/lib/cmake $(VENV)/share/*/cmake && \
 	find $(VENV)/lib -maxdepth 1 '(' -name libfastrtps.so -o -name 'libfastrtps.so.*.*.*' ')' -delete && \
 	$(pip) uninstall --yes iniconfig pluggy pygments pytest && \
 	find $(VENV)/lib -path '*.libs/*' -type f -exec md5sum {} + | sort | while read -r sum file; do \
 	    test "$$sum" = "$$last" && ln -f "$$kept" "$$file" || { last=$$sum; kept=$$file; }; \
 	done && \
-	{ strip -o $(VENV)/stripped $(llvm) 2>/dev/null && mv $(VENV)/stripped $(llvm) || true; } && \
+	find $(stripped) -name '*.so' | while read -r file; do \
+	    ! strip -o $(VENV)/stripped "$$file" 2>/dev/null || mv $(VENV)/stripped "$$file"; \
+	done && \
 	$(bin)/python -c 'import $(first_run)'; \
 	installed=$$?; wait $$kernels; exit $$installed
 	$(pip) install --no-deps --no-build-isolation --editable . --editable ./rs_relpose_lab
+	find $(packages)/pip -name __pycache__ -prune -exec rm -rf {} +
 	touch $@
 
 $(test_stamp): $(stamp) requirements/test.txt
