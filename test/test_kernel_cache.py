@@ -15,7 +15,7 @@ import pytest
 from test_package import imports, module_behind, MODULES, NAME
 
 from rs_relpose_ros.jit import source_digest, TRIED
-from rs_relpose_ros.pipeline.warm_up import look_up_symbols
+from rs_relpose_ros.kernel_loading import load_late
 
 # A package of this name with two kernels, one of which calls the other.
 INNER = """
@@ -176,45 +176,58 @@ def test_this_numba_was_tried():
     assert re.match(r'\d+\.\d+', numba.__version__)[0] in TRIED
 
 
-# Calls two kernels, then compares what the engine says of symbols with what its modules list.
-SYMBOLS = """
-import json
+# Calls kernels of the cache, then one that is linked with another; prints results, which modules
+# of loaded kernels are still bitcode before and after, and what the engine says of symbols.
+LATE = """
+import json, sys
 from numba.core.registry import cpu_target
-from rs_relpose_ros.pipeline import warm_up
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
-log_so3(exp_so3(__import__('numpy').ones(3)))
+from rs_relpose_ros.kernel_loading import LATE
+from rs_relpose_ros.inner import inner
+from rs_relpose_ros.outer import outer
+
 engine = cpu_target.target_context.codegen()._engine
-kept = vars(engine).get('kept_modules', [])
-symbols = [s for module in kept for s in (*module.functions, *module.global_variables)]
-inner = {s.name for s in symbols if s.linkage.name in ('internal', 'private')}
-defined = {s.name for s in symbols if not s.is_declaration} - inner
-declared = {s.name for s in symbols if s.is_declaration} - defined - engine._defined_symbols
-print(json.dumps([len(kept), len(defined), len(declared),
-                  all(map(engine.is_symbol_defined, defined)),
-                  any(map(engine.is_symbol_defined, [*declared, 'no such symbol']))]))
+def bitcode(kernel):
+    [loaded] = kernel.overloads.values()
+    return isinstance(vars(loaded.library).get('late_module'), bytes)
+results = [inner(3.0), outer(3.0)]
+before = [bitcode(inner), bitcode(outer)]
+results.append(__import__('further').further(3.0))
+after = [bitcode(inner), bitcode(outer)]
+[loaded] = outer.overloads.values()
+name = loaded.fndesc.llvm_func_name
+symbols = [engine.is_symbol_defined(name), engine.is_symbol_defined('no such symbol')]
+parsed = loaded.library._get_module_for_linking().get_function(name).name == name
+print(json.dumps([LATE, results, before, after, symbols, parsed]))
+"""
+FURTHER = """
+import numba
+from rs_relpose_ros.inner import inner
+
+@numba.njit
+def further(x):
+    return 10.0 * inner(x)
 """
 
 
-def test_symbols_of_kernels_are_looked_up():
-    """As if they were listed; listed where the private parts of Numba are not used."""
-    kept, defined, declared, finds_all, finds_another = json.loads(output(SYMBOLS, cwd=ROOT))
-    assert kept > 2
-    assert defined > 10
-    assert declared > 10
-    assert finds_all
-    assert not finds_another
+def test_bitcode_of_a_kernel_is_parsed_when_another_one_is_linked_with_it(package):
+    (package / 'further.py').write_text(FURTHER)
+    shutil.copy(ROOT / NAME / 'kernel_loading.py', package / NAME)
+    late = json.loads(output(LATE, cwd=package))
+    assert late == [True, [6.0, 7.0, 60.0], [True, True], [False, True], [True, False], True]
     public = {**os.environ, 'RS_RELPOSE_PUBLIC_NUMBA': '1'}
-    assert json.loads(output(SYMBOLS, cwd=ROOT, env=public))[0] == 0
+    for _ in ('compiled', 'loaded'):
+        usual = json.loads(output(LATE, cwd=package, env=public))
+        assert usual == [False, late[1], [False, False], [False, False], [True, False], True]
 
 
-def test_a_numba_without_the_engine_stays_as_it_is():
-    class Other:
-        is_symbol_defined = None
+def test_a_numba_without_the_private_parts_stays_as_it_is():
+    class Library:
+        _unserialize = classmethod(lambda cls, codegen, state: state)
 
-    for engine in (Other, None):
-        look_up_symbols(engine)
-    assert vars(Other)['is_symbol_defined'] is None
-    assert not hasattr(Other, '_load_defined_symbols')
+    before = dict(vars(Library))
+    assert not load_late(Library, None)
+    assert not load_late(None, None)
+    assert dict(vars(Library)) == before
 
 
 def test_every_import_of_a_kernels_module_counts(monkeypatch):

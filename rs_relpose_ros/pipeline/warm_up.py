@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import threading
-from typing import Any
 
 import cv2
 from llvmlite.binding import get_host_cpu_name
@@ -37,6 +36,7 @@ from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.jit import source_digest
+from rs_relpose_ros.kernel_loading import LATE  # noqa: F401 - its import changes Numba
 from rs_relpose_ros.pipeline.pair import Frame, Result
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.solvers.common import Solutions
@@ -155,46 +155,6 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     points2 = camera.project(world - [0.5, 0.0, 0.0])
     return points1, points2, camera, motion
 
-
-# -- Loading of kernels: symbols are looked up by name --------------------------------------------
-
-
-def look_up_symbols(engine: Any) -> None:
-    """Make `engine`, the class `JitEngine` of Numba, look symbols up instead of listing them.
-
-    A loaded kernel has a hundred symbols. Numba lists all of them, with three calls of LLVM for
-    each, and then asks for two or three: the list takes 0.15 s of the start of a node. The methods
-    that are replaced are private. A class without them stays as it is, with the same results.
-    """
-    if not (hasattr(engine, 'is_symbol_defined') and hasattr(engine, '_load_defined_symbols')):
-        return
-    is_listed = engine.is_symbol_defined
-
-    def keep(self: Any, module: Any) -> None:
-        vars(self).setdefault('kept_modules', []).append(module)
-
-    def is_defined(self: Any, name: str) -> bool:
-        # The newest first: Numba asks for what it has just added.
-        kept = reversed(vars(self).get('kept_modules', []))
-        return is_listed(self, name) or any(_defines(module, name) for module in kept)
-
-    engine._load_defined_symbols = keep
-    engine.is_symbol_defined = is_defined
-
-
-def _defines(module: Any, name: str) -> bool:
-    """Whether a module of LLVM defines a function or variable of this name for other modules."""
-    for get in (module.get_function, module.get_global_variable):
-        try:
-            if not get(name).is_declaration:
-                return True
-        except NameError:
-            continue
-    return False
-
-
-if not os.environ.get('RS_RELPOSE_PUBLIC_NUMBA'):
-    look_up_symbols(getattr(numba.core.codegen, 'JitEngine', None))
 
 # -- The cache of the kernels: other processes fill it, so that their memory is freed -------------
 
