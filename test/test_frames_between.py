@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros import estimate_relative_pose, EstimatorConfig, InputError, Status
 from rs_relpose_ros.core import reprojection
+from rs_relpose_ros.core.deviations import LENS, N_DEVIATIONS
 from rs_relpose_ros.estimator import adjustment, frames_between
 from rs_relpose_ros.estimator.arguments import IntermediateFrame
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -271,7 +272,7 @@ def test_derivatives_are_those_of_the_cost(fitted):
 
 def converged(arguments, state):
     """The optimum with the noise held, by Gauss-Newton steps."""
-    tracks, priors, _, expected, _ = arguments
+    tracks, priors, _, expected, *_ = arguments
     for _ in range(6):
         normal = adjustment.linearised(tracks, priors, state, expected)
         step = np.linalg.solve(normal.hessian, -normal.gradient)
@@ -298,7 +299,10 @@ def with_changes(tracks, changes, step):
     rows = tracks.observations.copy()
     flat = np.moveaxis(rows, 2, 3).reshape(V, -1, reprojection.VALUES)
     own, later = flat[:, :N], (changes.times @ step)[..., None]
-    own[..., reprojection.RAY : reprojection.RAY + 3] += changes.rays @ step
+    rays = own[..., reprojection.RAY : reprojection.RAY + 3]
+    of_lens = changes.lens @ step[LENS]
+    turned_lens = np.einsum('vnij,vnj->vni', changes.rows, of_lens)
+    rays += np.cross(changes.turns @ step, rays) + turned_lens
     moving = own[..., reprojection.MOVING : reprojection.MOVING + 3]
     own[..., reprojection.MOVED : reprojection.MOVED + 3] += later * moving
     own[..., reprojection.TIME] += later[..., 0]
@@ -319,19 +323,25 @@ def test_path_by_deviations_equals_finite_differences():
         )
         Scene(6, sigma=1e-3, gyro=1e-3, count=100).pose()
     arguments = calls[0]
-    tracks, priors, start, sigma, _ = arguments
+    tracks, priors, start, sigma, *_ = arguments
     state, rng = converged(arguments, start), np.random.default_rng(1)
-    V, N, D = len(tracks.used), tracks.number, 3
+    V, N, D = len(tracks.used), tracks.number, N_DEVIATIONS
     changes = reprojection.Changes(
-        np.zeros((V, N, 3, D)), np.zeros((V, N, D)), np.zeros((V, 3, D))
+        np.zeros((V, N, 3, D)),
+        np.zeros((V, N, D)),
+        np.zeros((V, 3, D)),
+        Rotation.random(V * N, random_state=2).as_matrix().reshape(V, N, 3, 3),
+        np.zeros((V, N, 3, LENS.stop - LENS.start)),
     )
-    changes.rays[..., 0] = rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
+    changes.turns[..., 0] = rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
     changes.times[..., 1] = rng.normal(size=(V, N))
     changes.rotations[1:, :, 2] = rng.normal(size=(V - 1, 3))
+    # Small, as its steps move the residuals the most.
+    changes.lens[..., 1] = 0.2 * rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
     normal = adjustment.linearised(tracks, priors, state, sigma)
-    exact = adjustment.path_by_deviations(tracks, state, normal, sigma, changes)
+    exact = adjustment.path_by_deviations(tracks, state, normal, changes)
     sigmas = 1.0 / np.sqrt(np.diag(normal.hessian))
-    for step in 5e-6 * np.eye(D):
+    for step in 5e-6 * np.eye(D)[[0, 1, 2, LENS.start + 1]]:
         up, down = (
             from_state(
                 state, converged((with_changes(tracks, changes, by), *arguments[1:]), state)
@@ -395,10 +405,10 @@ def test_optimum_is_that_of_an_independent_fit():
             frames_between.adjustment, 'adjust', lambda *a: (calls.append(a), adjust(*a))[1]
         )
         scene.pose()
-    tracks, priors, start, expected, weight = calls[0]
-    adjusted = adjust(tracks, priors, start, expected, weight)
+    tracks, priors, start, expected, weight, _ = calls[0]
+    adjusted = adjust(tracks, priors, start, expected, weight, 0.0)
     for _ in range(6):  # far beyond the steps of an estimate
-        adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)
+        adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9, 0.0)
     sigma = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
     directions, rho = (
         start.tracks[0, :3, :25].T,

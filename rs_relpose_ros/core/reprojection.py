@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.core.deviations import LENS
 from rs_relpose_ros.core.least_squares import first_indices
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
@@ -96,6 +97,9 @@ PHI = _ROWS['phi']  # by phi of the frame
 PATH = _ROWS['path']  # by the unknowns of the path
 PLACE = _ROWS['place']  # by the place p(s)
 ROWS = _ROWS['end']  # number of rows
+
+# Place of the first entry of the lens among the deviations.
+_FIRST_OF_LENS = LENS.start
 
 # Square of the sine of the parallax below which the distance of a track is not triangulated.
 # [chosen: 1e-4 rad, a tenth of a pixel; the adjustment finds the distance in any case]
@@ -334,11 +338,16 @@ def observe(
 
 
 class Changes(NamedTuple):
-    """Derivatives of what the tracks' residuals take as given, by D deviations."""
+    """Derivatives of what the tracks' residuals take as given, by all D deviations.
 
-    rays: Array  # (V, N, 3, D) of the derotated unit rays
+    Values of observations that are not used are arbitrary.
+    """
+
+    turns: Array  # (V, N, 3, D) of the derotated rays, by a rotation vector on their left [rad]
     times: Array  # (V, N, D) of s, from the reference row of the first frame [s]
     rotations: Array  # (V, 3, D) of R_v, by a rotation vector on its left [rad]
+    rows: Array  # (V, N, 3, 3) E_v of the rows
+    lens: Array  # (V, N, 3, L) of the unit rays in the camera's axes, by the entries of the lens
 
 
 @small_kernel
@@ -358,19 +367,24 @@ def observe_changes(
     `observe`, after it.
     """
     v, first = place
-    for d in range(len(out)):
-        turn = (changes.rotations[v, 0, d], changes.rotations[v, 1, d], changes.rotations[v, 2, d])
-        for i in range(BLOCK):
-            n = min(first + i, changes.rays.shape[1] - 1)  # rows of the rest of a block are zero
-            moving = _with_accelerations(
-                column(o, MOVING, i), _bending(o[TIME, i], path.duration), path
-            )
-            velocity = add(scale(1.0 / path.duration, path.t), scale(path.scale, moving))
-            by_time = scale(changes.times[v, n, d], velocity)
-            ray = (changes.rays[v, n, 0, d], changes.rays[v, n, 1, d], changes.rays[v, n, 2, d])
-            root = 1.0 / math.sqrt(variance + 0.25 * squares[i])
-            for m in range(2):
-                by_place = (rows[PLACE, m, i], rows[PLACE + 1, m, i], rows[PLACE + 2, m, i])
-                by_phi = (rows[PHI, m, i], rows[PHI + 1, m, i], rows[PHI + 2, m, i])
-                measured = root * dot(column(o, TO_PIXELS + 3 * m, i), ray)
-                out[d, m, i] = dot(by_place, by_time) + dot(by_phi, turn) - measured
+    out[:] = 0.0
+    for i in range(min(BLOCK, changes.times.shape[1] - first)):
+        bending = _bending(o[TIME, i], path.duration)
+        moving = _with_accelerations(column(o, MOVING, i), bending, path)
+        velocity = add(scale(1.0 / path.duration, path.t), scale(path.scale, moving))
+        root = 1.0 / math.sqrt(variance + 0.25 * squares[i])
+        turns, delays = changes.turns[v, first + i], changes.times[v, first + i]
+        lens = changes.lens[v, first + i]
+        for m in range(2):
+            by_ray = scale(root, column(o, TO_PIXELS + 3 * m, i))
+            by_turn = cross(by_ray, column(o, RAY, i))
+            by_phi = (rows[PHI, m, i], rows[PHI + 1, m, i], rows[PHI + 2, m, i])
+            by_place = (rows[PLACE, m, i], rows[PLACE + 1, m, i], rows[PLACE + 2, m, i])
+            by_time = dot(by_place, velocity)
+            for d in range(len(out)):
+                of_row = dot(by_turn, column(turns, 0, d))
+                of_frame = dot(by_phi, column(changes.rotations[v], 0, d))
+                out[d, m, i] = of_row + of_frame + by_time * delays[d]
+            by_unrotated = rotated_back(changes.rows[v, first + i], by_ray)
+            for k in range(lens.shape[1]):
+                out[_FIRST_OF_LENS + k, m, i] -= dot(by_unrotated, column(lens, 0, k))

@@ -63,7 +63,11 @@ _FLOOR = 1e-9
 _STEPS = 6
 # Decrease of the cost (chi-square) below which the fit ends: half a unit of chi-square moves no
 # unknown by a sigma. [chosen: any value in 0.1..1 would do]
-_CONVERGED = 0.5
+CONVERGED = 0.5
+# The same of a fit that only shows which observations are far from the others. A smaller value
+# takes more steps for the same observations; a larger one leaves good ones far.
+# [chosen: a hundredth of the degrees of freedom, any value in 5..30 would do]
+NEARLY_CONVERGED = 20.0
 # Largest step of log k. A longer one leaves the range in which the path is linear in it.
 # [chosen: a factor of e in the baseline]
 _LARGEST_STEP = 1.0
@@ -115,6 +119,7 @@ class Normal(NamedTuple):
     factors: Array  # (blocks, 3, 3, BLOCK) Cholesky factors of the tracks' own equations
     scatter: Array  # (n, n) of the tracks' parts of the gradient
     squares: Array  # (V, blocks, BLOCK) of the residuals [px^2]
+    noise: float  # of the observations, with the error that residuals do not show [px]
 
 
 class Adjusted(NamedTuple):
@@ -124,6 +129,7 @@ class Adjusted(NamedTuple):
     sigma: float
     covariance: Array
     far: Flags  # (V, blocks, BLOCK) observations far from their predictions
+    normal: Normal  # equations about the state
 
 
 @small_kernel
@@ -283,22 +289,23 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma:
         scatter += product
     hessian, gradient = whole[:n, :n].copy(), whole[n, :n].copy()
     of_priors = _add_priors(state, priors, hessian, gradient)
-    return Normal(of_priors, hessian, gradient, solved, factors, scatter, squares)
+    return Normal(of_priors, hessian, gradient, solved, factors, scatter, squares, sigma)
 
 
 @kernel
 def path_by_deviations(
-    tracks: TrackBlocks, state: PathState, normal: Normal, sigma: float, changes: Changes
+    tracks: TrackBlocks, state: PathState, normal: Normal, changes: Changes
 ) -> Array:
     """Derivative (n, D) of the optimum's path by deviations of what the residuals take as given.
 
-    `normal` are the equations about the optimum `state`, with the noise `sigma` [px].
+    `normal` are the equations about the optimum `state`.
 
     ``-H^-1 C``, with the Hessian H of the path and its products C with the deviations, the tracks
     eliminated from both.
     """
     V, blocks, _ = tracks.used.shape
     n, D = len(normal.gradient), changes.rotations.shape[2]
+    variance = normal.noise * normal.noise
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
     path, rotations = _path(state, tracks.duration), _turned(tracks, state)
     used_rows = PATH - RESIDUAL + path_unknowns
@@ -315,9 +322,9 @@ def path_by_deviations(
         for v in range(V):
             o = tracks.observations[v, b]
             moves = float(min(v, 1))
-            observe(o, state.tracks[b], rotations[v], moves, path, sigma * sigma, rows, squares)
+            observe(o, state.tracks[b], rotations[v], moves, path, variance, rows, squares)
             place = (v, b * BLOCK)
-            observe_changes(o, rows, squares, path, sigma * sigma, changes, place, columns)
+            observe_changes(o, rows, squares, path, variance, changes, place, columns)
             places = _places(v, path_unknowns, n)
             np.dot(used, columns.reshape(D, 2 * BLOCK).T, products)
             for d in range(D):
@@ -398,11 +405,17 @@ def _step(normal: Normal, damping: float) -> Array:
 
 @kernel
 def adjust(
-    tracks: TrackBlocks, priors: PathPriors, start: PathState, expected: float, weight: float
+    tracks: TrackBlocks,
+    priors: PathPriors,
+    start: PathState,
+    expected: float,
+    weight: float,
+    converged: float,
 ) -> Adjusted:
     """Levenberg-Marquardt over path and tracks, the noise estimated again after each step.
 
-    `expected` [px]: noise, which counts as much as `weight` degrees of freedom.
+    `expected` [px]: noise, which counts as much as `weight` degrees of freedom. Steps end with
+    one that decreases the cost (chi-square) by less than `converged`.
     """
     observations = 2.0 * tracks.used.sum()
     state, sigma, noise, damping = start, expected, expected, _FIRST_DAMPING
@@ -420,7 +433,7 @@ def adjust(
         gain = _cost(normal, tracks, sigma)[0] - _cost(new, tracks, sigma)[0]
         if gain > 0.0:  # False for NaN
             state, normal, damping = after, new, 0.1 * damping
-            if gain < _CONVERGED:
+            if gain < converged:
                 break
         else:
             damping = max(100.0 * damping, 1e-4)
@@ -429,6 +442,7 @@ def adjust(
         noise,
         _covariance(normal, state, priors, (sigma / noise) ** 2, tracks.number),
         normal.squares > (_FARTHEST * sigma) ** 2,
+        normal,
     )
 
 

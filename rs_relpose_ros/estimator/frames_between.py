@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import MOTIONS
-from rs_relpose_ros.core.deviations import LENS, LIVE, Selection
+from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.core.reprojection import (
     ACCELERATION,
     BIAS,
+    BLOCK,
     Changes,
     empty_blocks,
     fill_view,
@@ -37,7 +39,6 @@ from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import by_axes, exp_so3, log_so3, median, skew, tangent_basis
@@ -56,9 +57,10 @@ _SIGMA_FREEDOM = 10.0
 # Least number of inliers that a frame between must have, to be worth its six unknowns.
 # [chosen: 20 coordinates; frames with 5..20 inliers are rare]
 _LEAST_TRACKS = 10
-# Most inliers of a pair that are adjusted: more cost time. 200 of 280 cost 8 % of t and R on
-# simulated walks, nothing on recordings, where tracks share larger errors. [measured: both]
-_MOST_TRACKS = 200
+# Most inliers of a pair that are adjusted, in whole blocks: more cost time, fewer accuracy.
+# [measured: 200 of 280 cost 8 % of t and R on simulated walks, nothing on recordings, where tracks
+# share larger errors; 192 in place of 200 make sigmas larger by 2 %]
+_MOST_TRACKS = 3 * BLOCK
 # Noise of the observations, as a part of `threshold`, beyond which tracks and gyro contradict each
 # other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
 # of the frames, so that the covariance would be too small. [derived: 4 sigmas in 2 thresholds]
@@ -86,7 +88,8 @@ def refined(
             frames_reason='no frame between has a rotation by the gyro and '
             f'{_LEAST_TRACKS} inliers of the pair',
         )
-    tracks = _track_blocks(path)
+    observed = _observed(path)
+    tracks = _track_blocks(path, observed)
     priors = _priors(path)
     state = _start(
         pose,
@@ -96,18 +99,25 @@ def refined(
     )
     sigma = config.pixel_sigma
     expected = min(max(pose.diagnostics.residual_rms, _LEAST_NOISE * sigma), sigma)
-    for _ in range(2):  # once more without the observations far from the first result
-        adjusted = adjustment.adjust(
-            tracks,
-            priors,
-            state,
-            expected,
-            _SIGMA_FREEDOM,
-        )
-        state = adjusted.state
-        tracks.used[adjusted.far] = False
-        tracks.observations.swapaxes(2, 3)[adjusted.far, TO_PIXELS:TIME] = 0.0
-    distances = state.tracks[:, INVERSE_DISTANCE][tracks.used[0]]  # a copy
+    nearly = adjustment.adjust(
+        tracks,
+        priors,
+        state,
+        expected,
+        _SIGMA_FREEDOM,
+        adjustment.NEARLY_CONVERGED,
+    )
+    tracks.used[nearly.far] = False
+    tracks.observations.swapaxes(2, 3)[nearly.far, TO_PIXELS:TIME] = 0.0
+    adjusted = adjustment.adjust(
+        tracks,
+        priors,
+        nearly.state,
+        expected,
+        _SIGMA_FREEDOM,
+        adjustment.CONVERGED,
+    )
+    distances = adjusted.state.tracks[:, INVERSE_DISTANCE][tracks.used[0]]  # a copy
     if not (np.isfinite(adjusted.covariance).all() and median(distances) > 0.0):
         return pose.diagnosed(frames_reason='the adjustment of all frames does not converge')
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, sigma):
@@ -122,28 +132,13 @@ def refined(
         tracks,
         priors,
     )
-    changes = _changes_by(LIVE, path)
+    changes = _changes(path, observed)
     if changes is None:
         return pose
-    by_deviation = _pose_by_deviation(adjusted, tracks, priors, changes)
-    return replace(pose, by_deviation=by_deviation)
-
-
-def _pose_by_deviation(
-    adjusted: Adjusted,
-    tracks: TrackBlocks,
-    priors: PathPriors,
-    changes: Changes,
-) -> Array:
-    """Derivative (6, D) of the pose from all frames by the deviations of `changes`."""
-    # The noise of the fit, with the error that residuals do not show.
-    noise = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
-    state = adjusted.state
-    normal = adjustment.linearised(tracks, priors, state, noise)
-    moved = adjustment.path_by_deviations(tracks, state, normal, noise, changes)
+    moved = adjustment.path_by_deviations(tracks, adjusted.state, adjusted.normal, changes)
     by_deviation = _pose_by_path(adjusted, tracks) @ moved
     by_deviation[3:] += changes.rotations[-1]
-    return by_deviation
+    return replace(pose, by_deviation=by_deviation @ LIVE.of_camera(path.camera))
 
 
 def _with_inliers(
@@ -222,33 +217,56 @@ def _camera_by_imu(path: PairProblem) -> tuple[Array, Array, Array]:
 # -- The adjustment's data, priors and start ------------------------------------------------------
 
 
-def _track_blocks(path: PairProblem) -> TrackBlocks:
-    """Observations of the inliers."""
+class _Observed(NamedTuple):
+    """The inliers of a pair in its V frames, as observed; arbitrary where they are not used."""
+
+    used: NDArray[np.bool_]  # (V, N) in the image, of tracks that start in it
+    rows: Array  # (V, N)
+    times: Array  # (V, N) of the rows after the reference row of the frame [s]
+    rays: Array  # (V, N, 3) unit rays in the camera's axes at their rows
+    by_pixel: Array  # (V, N, 3, 2) derivatives of the rays by their pixels
+    by_lens: Array  # (V, N, 3, L) derivatives of the rays by the entries of the lens
+
+
+def _observed(path: PairProblem) -> _Observed:
+    """Rays and row times of the observations; the gyro covers the rows of the image only."""
     camera = path.camera
     points = path.matches.points
     views, count = points.shape[:2]
-    rays, jacobian = camera.unproject_with_jacobian(points.reshape(-1, 2))
-    rays = rays.reshape(views, count, 3)
-    jacobian = jacobian.reshape(
-        views,
-        count,
-        3,
-        2,
-    )
     rows = camera.rows_of(points)
-    used = _usable(rays, rows, camera.row_count)
+    known = np.isfinite(points).all(axis=2)
+    inside = known & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
+    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
+    pixels = np.where(inside[..., None], points, middle)
+    rays, by_pixel, by_lens = camera.unproject_by_lens(pixels.reshape(-1, 2))
+    rays = rays.reshape(views, count, 3)
+    used = inside & np.isfinite(rays).all(axis=2)
     rows = np.where(used, rows, camera.reference_row_index)
+    return _Observed(
+        used & used[0],
+        rows,
+        camera.row_times(rows),
+        rays,
+        by_pixel.reshape(views, count, 3, -1),
+        by_lens.reshape(views, count, 3, -1),
+    )
+
+
+def _track_blocks(path: PairProblem, observed: _Observed) -> TrackBlocks:
+    """Observations of the inliers in blocks."""
+    camera = path.camera
+    count = observed.used.shape[1]
     tracks = empty_blocks(path.rotations, float(path.seconds[-1]), count)
-    times = camera.row_times(rows)
     alphas, betas, accelerations = _moved_by_imu(path)
     arm, chord, _ = _camera_by_imu(path)
     for view, motion in enumerate(path.motions):
+        times = observed.times[view]
         frame = FrameRays(
-            used[view],
-            rays[view],
-            jacobian[view],
-            times[view],
-            motion.rotations(times[view]),
+            observed.used[view],
+            observed.rays[view],
+            observed.by_pixel[view],
+            times,
+            motion.rotations(times),
             camera.line_delay * motion.angular_velocity,
             camera.readout_axis,
             motion.angular_velocity,
@@ -268,19 +286,6 @@ def _track_blocks(path: PairProblem) -> TrackBlocks:
             inertia,
         )
     return tracks
-
-
-def _usable(
-    rays: Array,
-    rows: Array,
-    row_count: int,
-) -> NDArray[np.bool_]:
-    """Which observations (V, N) are used: in the image, of tracks that start in it.
-
-    The gyro covers the rows of the image only.
-    """
-    used = np.isfinite(rays).all(axis=2) & (rows >= 0.0) & (rows <= row_count - 1.0)
-    return np.asarray(used & used[0])
 
 
 def _priors(path: PairProblem) -> PathPriors:
@@ -450,60 +455,25 @@ def _velocities(
 # it, and the time offset of a selection is the one of the stamped row, as the parameter.
 
 
-def _changes_by(selection: Selection, problem: PairProblem) -> Changes | None:
-    """Changes of rays, times and rotations by a selection; None without the gyro of the pair.
-
-    Observations that are not used have arbitrary values.
-    """
-    if problem.gyro is None or problem.R_cam_imu is None:
+def _changes(path: PairProblem, observed: _Observed) -> Changes | None:
+    """Changes of rays, times and rotations by deviations; None without the gyro of the pair."""
+    if path.gyro is None or path.R_cam_imu is None:
         return None
-    camera = problem.camera
-    basis = selection.of_camera(camera)
-    pixels = _within_image(camera, problem.matches.points)
-    views, count = pixels.shape[:2]
-    rows = camera.rows_of(pixels)
-    of_lens = camera.rays_by_lens(pixels.reshape(-1, 2))
-    rays = of_lens.values.reshape(views, count, 3)
-    by_lens = of_lens.by_lens.reshape(views, count, 3, -1)
-    shares = (rows - camera.reference_row_index) / camera.row_count
-    times = camera.row_times(rows)
-    of_rays = np.empty((views, count, 3, selection.size))
-    of_times = np.empty((views, count, selection.size))
-    for view, motion in enumerate(problem.motions):
-        path = _path_of_rows(motion)
-        states = row_states(path, problem.R_cam_imu, times[view], shares[view])
-        turned = np.einsum('nij,nj->ni', states.rotation, rays[view])
-        turns = _by_columns(states.by_deviation, basis)
-        turned_lens = np.einsum('nij,njk->nik', states.rotation, by_lens[view])
-        of_rays[view] = _by_columns(turned_lens, basis[LENS])
-        for axis in range(3):
-            later, last = (axis + 1) % 3, (axis + 2) % 3
-            of_rays[view, :, axis] += turns[:, later] * turned[:, last, None]
-            of_rays[view, :, axis] -= turns[:, last] * turned[:, later, None]
-        of_times[view] = states.time_by_deviation @ basis
-    between = row_states(problem.gyro, problem.R_cam_imu, problem.seconds, np.zeros(views))
-    return Changes(of_rays, of_times, np.ascontiguousarray(between.by_deviation @ basis))
-
-
-def _by_columns(derivatives: Array, basis: Array) -> Array:
-    """Derivatives (N, 3, D) by columns of `basis` (K, D), from those by K deviations (N, 3, K).
-
-    One product of all rows: NumPy would call BLAS once for each of N small matrices.
-    """
-    product = derivatives.reshape(-1, len(basis)) @ basis
-    return np.asarray(product.reshape(len(derivatives), 3, -1))
-
-
-def _within_image(camera: RollingShutterCamera, points: Array) -> Array:
-    """Pixels (V, N, 2); those outside of the rows, which the gyro covers, are put into the middle.
-
-    Observations that do not exist are put there, too.
-    """
-    rows = camera.rows_of(points)
-    known = np.isfinite(points).all(axis=2)
-    inside = known & (rows >= 0.0) & (rows <= camera.row_count - 1.0)
-    middle = 0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0)
-    return np.asarray(np.where(inside[..., None], points, middle))
+    camera = path.camera
+    shares = (observed.rows - camera.reference_row_index) / camera.row_count
+    frames = [
+        row_states(_path_of_rows(motion), path.R_cam_imu, observed.times[view], shares[view])
+        for view, motion in enumerate(path.motions)
+    ]
+    at_stamps = np.zeros(len(path.seconds))
+    between = row_states(path.gyro, path.R_cam_imu, path.seconds, at_stamps)
+    return Changes(
+        np.stack([states.by_deviation for states in frames]),
+        np.stack([states.time_by_deviation for states in frames]),
+        between.by_deviation,
+        np.stack([states.rotation for states in frames]),
+        observed.by_lens,
+    )
 
 
 def _path_of_rows(motion: FrameMotion) -> GyroPath:

@@ -18,6 +18,7 @@ from rs_relpose_ros.geometry.lens import (
     CompiledLens,
     DISTORTION_MODELS,
     DistortionModel,
+    first_order_by_lens,
     points_by_lens,
     project_points,
     project_rotating,
@@ -225,6 +226,18 @@ class RollingShutterCamera:
         """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
         normalized, by_distorted = self._undistorted(self._distorted(points))
         return rays_with_jacobian(normalized, by_distorted / (self.fx, self.fy))
+
+    def unproject_by_lens(self, points: ArrayLike) -> tuple[Array, Array, Array]:
+        """Unit rays (N, 3), with their derivatives by the pixel and by the lens.
+
+        These are (N, 3, 2), and (N, 3, 7) in the order of `geometry.lens.LENS_ENTRIES`.
+        """
+        distorted = self._distorted(points)
+        normalized, by_distorted = self._undistorted(distorted)
+        focal = (self.fx, self.fy)
+        of_points = first_order_by_lens(distorted, normalized, by_distorted, focal, self._compiled)
+        rays, by_pixel = rays_with_jacobian(normalized, of_points[0])
+        return rays, by_pixel, rays_with_jacobian(normalized, of_points[1])[1]
 
     def points_by_lens(self, points: ArrayLike) -> ByLens:
         """Normalised points ``(x, y)`` at z = 1 of raw pixels (N, 2), with all derivatives.

@@ -496,34 +496,29 @@ def _write_both(
 
 
 @kernel
-def points_by_lens(
+def first_order_by_lens(
     distorted: Array,
     points: Array,
     by_distorted: Array,
     focal: tuple[float, float],
     lens: CompiledLens,
-) -> ByLens:
-    """Derivatives of normalised points n by the pixel and by the lens.
+) -> tuple[Array, Array]:
+    """Derivatives of normalised points n by the pixel (N, 2, 2) and by the lens (N, 2, 7).
 
     `points` (N, 2) are undistorted, and `by_distorted` (N, 2, 2) are their derivatives A by the
     distorted points d (N, 2), both as of `undistort_points`; `focal` is (fx, fy) [px]. With
     J = dD/dn, the equation ``D(n) = d`` holds for all pixels and lenses, so by a value q of the
-    lens
-
-        dn/dq = A (dd/dq - dD/dq)          d2n/(du dq) = -A (dJ/dq) dn/du + A (d2d / (du dq))
+    lens ``dn/dq = A (dd/dq - dD/dq)``.
     """
     count = len(points)
     by_pixel = np.empty((count, 2, 2))
     by_lens = np.empty((count, 2, N_LENS))
-    by_both = np.empty((count, 2, 2, N_LENS))
     profile = np.empty(_PROFILE)
-    bends = np.empty((2, 2, 2))
     for i in range(count):
         x = points[i, 0]
         y = points[i, 1]
         A = by_distorted[i]
         profile_at(lens.profile, x * x + y * y, lens.radial, profile)
-        _bends(x, y, lens, profile, bends)
         for c in range(2):
             of_c = by_lens[i, c]
             toward = _dot(A[c], points[i])
@@ -535,6 +530,34 @@ def points_by_lens(
                 step = A[c, u] / focal[u]
                 by_pixel[i, c, u] = step
                 of_c[2 + _N_RADIAL + u] = -step
+    return by_pixel, by_lens
+
+
+@kernel
+def points_by_lens(
+    distorted: Array,
+    points: Array,
+    by_distorted: Array,
+    focal: tuple[float, float],
+    lens: CompiledLens,
+) -> ByLens:
+    """Derivatives of normalised points n by the pixel, by the lens, and by both.
+
+    The arguments are those of `first_order_by_lens`. Once more by the pixel u::
+
+        d2n/(du dq) = -A (dJ/dq) dn/du + A (d2d / (du dq))
+    """
+    count = len(points)
+    by_pixel, by_lens = first_order_by_lens(distorted, points, by_distorted, focal, lens)
+    by_both = np.empty((count, 2, 2, N_LENS))
+    profile = np.empty(_PROFILE)
+    bends = np.empty((2, 2, 2))
+    for i in range(count):
+        x = points[i, 0]
+        y = points[i, 1]
+        profile_at(lens.profile, x * x + y * y, lens.radial, profile)
+        _bends(x, y, lens, profile, bends)
+        A = by_distorted[i]
         _write_both(points[i], A, profile, bends, by_pixel[i], by_lens[i], by_both[i])
     return ByLens(points, by_pixel, by_lens, by_both)
 
