@@ -59,8 +59,8 @@ _SIGMA_FREEDOM = 10.0
 _LEAST_TRACKS = 10
 # Most inliers of a pair that are adjusted, in whole blocks: more cost time, fewer accuracy.
 # [measured: 200 of 280 cost 8 % of t and R on simulated walks, nothing on recordings, where tracks
-# share larger errors; 192 in place of 200 make sigmas larger by 2 %]
-_MOST_TRACKS = 3 * BLOCK
+# share larger errors; 256 take 1.2 of the time]
+_MOST_TRACKS = 5 * BLOCK
 # Noise of the observations, as a part of `threshold`, beyond which tracks and gyro contradict each
 # other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
 # of the frames, so that the covariance would be too small. [derived: 4 sigmas in 2 thresholds]
@@ -91,25 +91,43 @@ def refined(
     observed = _observed(path)
     tracks = _track_blocks(path, observed)
     priors = _priors(path)
-    state = _start(
-        pose,
-        path,
-        tracks,
-        priors,
-    )
-    sigma = config.pixel_sigma
+    adjusted = _adjusted(_start(pose, path, tracks, priors), pose, path, tracks, priors)
+    distances = adjusted.state.tracks[:, INVERSE_DISTANCE][tracks.used[0]]  # a copy
+    if not (np.isfinite(adjusted.covariance).all() and median(distances) > 0.0):
+        return pose.diagnosed(frames_reason='the adjustment of all frames does not converge')
+    if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):
+        return pose.diagnosed(
+            frames_reason='tracks and gyro of the frames between contradict each '
+            f'other: {adjusted.sigma:.1f} px',
+        )
+    pose = _result(pose, adjusted, path, tracks, priors)
+    changes = _changes(path, observed)
+    if changes is None:
+        return pose
+    return replace(pose, by_deviation=_pose_by_deviation(adjusted, path, tracks, changes))
+
+
+def _adjusted(
+    start: PathState,
+    pose: RelativePose,
+    path: PairProblem,
+    tracks: TrackBlocks,
+    priors: PathPriors,
+) -> Adjusted:
+    """The adjusted path; observations far from a first result are removed from `tracks`."""
+    sigma = path.config.pixel_sigma
     expected = min(max(pose.diagnostics.residual_rms, _LEAST_NOISE * sigma), sigma)
     nearly = adjustment.adjust(
         tracks,
         priors,
-        state,
+        start,
         expected,
         _SIGMA_FREEDOM,
         adjustment.NEARLY_CONVERGED,
     )
     tracks.used[nearly.far] = False
     tracks.observations.swapaxes(2, 3)[nearly.far, TO_PIXELS:TIME] = 0.0
-    adjusted = adjustment.adjust(
+    return adjustment.adjust(
         tracks,
         priors,
         nearly.state,
@@ -117,28 +135,16 @@ def refined(
         _SIGMA_FREEDOM,
         adjustment.CONVERGED,
     )
-    distances = adjusted.state.tracks[:, INVERSE_DISTANCE][tracks.used[0]]  # a copy
-    if not (np.isfinite(adjusted.covariance).all() and median(distances) > 0.0):
-        return pose.diagnosed(frames_reason='the adjustment of all frames does not converge')
-    if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, sigma):
-        return pose.diagnosed(
-            frames_reason='tracks and gyro of the frames between contradict each '
-            f'other: {adjusted.sigma:.1f} px',
-        )
-    pose = _result(
-        pose,
-        adjusted,
-        path,
-        tracks,
-        priors,
-    )
-    changes = _changes(path, observed)
-    if changes is None:
-        return pose
+
+
+def _pose_by_deviation(
+    adjusted: Adjusted, path: PairProblem, tracks: TrackBlocks, changes: Changes
+) -> Array:
+    """Derivative (6, K) of the pose from all frames by the deviations of `LIVE`."""
     moved = adjustment.path_by_deviations(tracks, adjusted.state, adjusted.normal, changes)
     by_deviation = _pose_by_path(adjusted, tracks) @ moved
     by_deviation[3:] += changes.rotations[-1]
-    return replace(pose, by_deviation=by_deviation @ LIVE.of_camera(path.camera))
+    return np.asarray(by_deviation @ LIVE.of_camera(path.camera))
 
 
 def _with_inliers(
