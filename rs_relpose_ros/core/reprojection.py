@@ -48,8 +48,8 @@ from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 Flags = NDArray[np.bool_]
 
 # Tracks of a block. Fewer leave a part of the vector registers unused; more do not fit into the
-# nearest cache with their rows. [chosen: any multiple of 8 in 32..128 would do; 40 divides the most
-# tracks of a pair]
+# nearest cache with their rows.
+# [chosen: any multiple of 8 in 32..128 would do; 40 divides the most tracks of a pair]
 BLOCK = 40
 # Most polynomials of the unknown acceleration: of a higher degree, only the prior would determine
 # them. [chosen: pairs span a few correlation times of the acceleration]
