@@ -78,7 +78,7 @@ class StillView:
         """IMU data since the last new image, `previous`; None if this image is not new.
 
         An image after a lost one may repeat that one, which nobody can compare it with: where a
-        driver is known to repeat images it is not used, and the next one is compared with it.
+        driver has repeated an image it is not used, and the next one is compared with it.
         """
         since = imu.since_previous
         assert since is not None
@@ -91,7 +91,7 @@ class StillView:
         self.static = self._parts.static()
         self._repeated.append(repeated)
         self._stamps_ns.append(stamp_ns)
-        may_repeat = self._repeats() and self._follows_a_loss()
+        may_repeat = any(self._repeated) and self._follows_a_loss()
         if not repeated and not may_repeat:
             self._skipped = self._doubtful = None
             return replace(imu, since_previous=since_new)
@@ -101,10 +101,6 @@ class StillView:
         elif self._doubtful is not None:
             self._doubtful = self._doubtful._replace(passed=since_compared)
         return None
-
-    def _repeats(self) -> bool:
-        """Whether the driver is known to repeat images."""
-        return sum(self._repeated) >= _REPORTED
 
     def _follows_a_loss(self) -> bool:
         """Whether images before the last one are missing, by the interval of the camera."""
@@ -119,8 +115,9 @@ class StillView:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on repeated images and on static parts."""
         found = []
-        if self._repeats():
-            measured = {'repeated': sum(self._repeated), 'images': len(self._repeated)}
+        repeated = sum(self._repeated)
+        if repeated >= _REPORTED:
+            measured = {'repeated': repeated, 'images': len(self._repeated)}
             found.append(_still(Code.REPEATED_IMAGES, measured))
         if self.static.any():
             found.append(_still(Code.STATIC_REGION, self._extent()))
