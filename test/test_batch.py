@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros.cli import batch, main
-from rs_relpose_ros.cli.batch import Bag, DONE, Files, Job, Row, run_jobs
+from rs_relpose_ros.cli.batch import BagFiles, DONE, Files, Job, Row, run_jobs
 
 pytest.importorskip('distributed', reason='needs the extra batch')
 # Clusters start, and a first run compiles kernels.
@@ -67,7 +67,7 @@ def test_names_of_results_differ(paths, names):
 
 @pytest.mark.parametrize('state', batch.STATES)
 def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state):
-    bag = Bag('/bags/a', 5, 7, 'a: 1\n')
+    bag = BagFiles('/bags/a', 5, 7, 'a: 1\n')
     job = Job('check', bag, 'a', ('--set', 'seed=1'), '1')
     row = job.row(state, 'because', 1.5, {'pairs': 3, 'shutter': None})
     batch.store(job, row, {'check.json': b'{}', 'in/it.txt': b'text'}, tmp_path)
@@ -93,7 +93,7 @@ def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state)
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
 @pytest.mark.parametrize('file', ['a/check.json', 'a/job.json', 'results.csv'])
 def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
-    job = Job('check', Bag('/bags/a', 5, 7, ''), 'a', (), '1')
+    job = Job('check', BagFiles('/bags/a', 5, 7, ''), 'a', (), '1')
     (tmp_path / 'a').mkdir()
     (tmp_path / f'{file}.part').symlink_to('/dev/full')
     with pytest.raises(OSError, match='No space left') as found:

@@ -33,7 +33,7 @@ from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check import check_bag, quantity_findings
-from rs_relpose_ros.offline.check_recording import Stamps
+from rs_relpose_ros.offline.check_recording import StampStatistics
 from rs_relpose_ros.tracking.images import Pixels
 
 START, TYPES = 1_700_000_000_000_000_000, build.rosbags_types
@@ -749,6 +749,6 @@ def test_bad_usage(arguments, message, tmp_path, refused):
 
 def test_steps_between_stamps():
     times = [k * 5 * MS + (100 * MS if k > 10_000 else 0) for k in range(20_000)]
-    stamps = Stamps(times, times)
+    stamps = StampStatistics(times, times)
     assert stamps.interval == pytest.approx(0.005) and stamps.count == 20_000
     assert (stamps.forwards > 0.05).sum() == 1 and stamps.longest == pytest.approx(0.105)

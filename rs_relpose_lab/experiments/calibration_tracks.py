@@ -133,8 +133,9 @@ def _gyro(
     )
 
 
-def _world(rng: np.random.Generator, count: int = 4000) -> Array:
+def _world(rng: np.random.Generator) -> Array:
     """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
+    count = 4000
     azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
     distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
     direction = np.stack(

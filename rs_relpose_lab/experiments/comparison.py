@@ -171,35 +171,25 @@ def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
 
     A pose that only one of the two has counts as different.
     """
-    columns = (
-        'tx',
-        'ty',
-        'tz',
-        'qx',
-        'qy',
-        'qz',
-        'qw',
-        'sigma_t1',
-        'sigma_t2',
-        'sigma_rx',
-        'sigma_ry',
-        'sigma_rz',
-        'inliers',
-    )
-    tables = []
-    for path in (live, replayed):
-        with path.open(newline='', encoding='ascii') as file:
-            tables.append(
-                {
-                    (row['reference_stamp_ns'], row['stamp_ns']): [
-                        row[column] for column in columns
-                    ]
-                    for row in csv.DictReader(file)
-                    if row['status'] == Status.OK.value
-                }
-            )
-    keys = tables[0].keys() | tables[1].keys()
-    return sum(tables[0].get(key) != tables[1].get(key) for key in keys), len(keys)
+    live_poses = _written_poses(live)
+    replayed_poses = _written_poses(replayed)
+    keys = live_poses.keys() | replayed_poses.keys()
+    return sum(live_poses.get(key) != replayed_poses.get(key) for key in keys), len(keys)
+
+
+# Columns of the table of poses that are compared: the pose, its sigmas, and the inliers.
+_COMPARED = POSES.columns[2 : POSES.columns.index('matches')]
+
+
+def _written_poses(table: Path) -> dict[tuple[str, str], list[str]]:
+    """What a table of poses has of each pair with a pose, by both of its stamps."""
+    poses = {}
+    with table.open(newline='', encoding='ascii') as file:
+        for row in csv.DictReader(file):
+            if row['status'] == Status.OK.value:
+                stamps = row['reference_stamp_ns'], row['stamp_ns']
+                poses[stamps] = [row[column] for column in _COMPARED]
+    return poses
 
 
 def best_opencv_score(

@@ -30,7 +30,7 @@ from rs_relpose_ros.odometry.offline import follow, path_of
 from rs_relpose_ros.odometry.pair import Body, deviations, Measured, Mount, row_ns, square_root
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
+from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, PairStamps
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 from rs_relpose_ros.pipeline.warm_up import warm_up
@@ -128,7 +128,7 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
 
 
 def _related(
-    recording: Recording, simulation: Simulation, stamps: list[Stamps]
+    recording: Recording, simulation: Simulation, stamps: list[PairStamps]
 ) -> list[PairResult]:
     """Pairs of rendered images."""
     wanted = {stamp for pair in stamps for stamp in pair}
@@ -140,7 +140,7 @@ def _related(
     parameters = Parameters.from_mapping(recording.configured.values)
     warm_up(parameters.estimator)
     loop = FrameLoop(parameters, ChosenPairs(stamps), offline=True)
-    found: dict[Stamps, PairResult | str] = {}
+    found: dict[PairStamps, PairResult | str] = {}
     for frame in trust_runs.processed(
         replace(recording, image=image, sightings=None), recording.configured, loop
     ):

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
-from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.geometry.so3 import Vector
+from rs_relpose_ros.imu.buffer import ImuSample
 
 Gray = NDArray[np.uint8]
 

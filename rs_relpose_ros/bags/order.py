@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Times = NDArray[np.int64]
+from rs_relpose_ros.geometry.timing import Stamps
 
 # Messages that count as a clock that was set back. Fewer may have been late, or one of them may
 # have a wrong stamp. [chosen: the clock of a camera of 30 Hz is then recognised from 0.1 s on]
@@ -27,7 +27,7 @@ _COVERED_TWICE = 1.5
 _BETWEEN_RUNS_NS = 1_000_000_000
 
 
-def clock_runs(stamps: Times) -> NDArray[np.int64]:
+def clock_runs(stamps: Stamps) -> NDArray[np.int64]:
     """Number of the run of each message (N,): how often its clock was set back before.
 
     `stamps` (N,) [ns] in the order of the file.
@@ -49,7 +49,7 @@ def clock_runs(stamps: Times) -> NDArray[np.int64]:
     return runs
 
 
-def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
+def _is_reset(before: Stamps, after: Stamps, top: int, period: float) -> bool:
     """Whether a clock was set back, and messages were not merely late.
 
     `before` and `after` the step (N,) and (M,) [ns]; `top` is the largest stamp before it.
@@ -72,7 +72,7 @@ def _is_reset(before: Times, after: Times, top: int, period: float) -> bool:
     return is_empty or is_covered_twice
 
 
-def reading_times(stamps: Times, topics: NDArray[np.int64], sensors: Sequence[int]) -> Times:
+def reading_times(stamps: Stamps, topics: NDArray[np.int64], sensors: Sequence[int]) -> Stamps:
     """Times (N,) [ns] in whose order messages are read: their stamps, unless a clock was set back.
 
     `stamps` (N,) [ns] and `topics` (N,), the number of the topic of each, are in the order of the

@@ -37,7 +37,7 @@ from rs_relpose_ros.calibration.observations import (
     PairSelection,
     TrackedPoints,
 )
-from rs_relpose_ros.calibration.readout_axis import along_other_axis
+from rs_relpose_ros.calibration.readout_direction import along_other_axis
 from rs_relpose_ros.calibration.rotations import LEAST_RAYS
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.core import radial

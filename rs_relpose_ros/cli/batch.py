@@ -190,7 +190,7 @@ def _options(args: argparse.Namespace) -> tuple[tuple[str, ...], str | None]:
 # -- Jobs: the bags, on the workers ---------------------------------------------------------------
 
 
-class Bag(NamedTuple):
+class BagFiles(NamedTuple):
     """A bag in the file system of the workers."""
 
     path: str
@@ -203,7 +203,7 @@ class Job(NamedTuple):
     """A command of `rs_relpose`, one bag, and its options."""
 
     command: str
-    bag: Bag
+    bag: BagFiles
     name: str  # of the folder of its results
     options: tuple[str, ...]
     version: str  # of this package
@@ -232,9 +232,9 @@ class Job(NamedTuple):
         }
 
 
-def find_bags(paths: Sequence[str]) -> list[Bag]:
+def find_bags(paths: Sequence[str]) -> list[BagFiles]:
     """Bags at paths and globs, in the order of the paths; a path without a bag has size -1."""
-    found: dict[str, Bag] = {}
+    found: dict[str, BagFiles] = {}
     for pattern in paths:
         # A glob also matches parameter files and other folders.
         matching = sorted(
@@ -247,7 +247,7 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
     return list(found.values())
 
 
-def _bag_at(path: Path) -> Bag:
+def _bag_at(path: Path) -> BagFiles:
     is_folder = path.is_dir()
     files = path.iterdir() if is_folder else [path]
     states = [file.stat() for file in files if file.is_file()]
@@ -258,7 +258,7 @@ def _bag_at(path: Path) -> Bag:
     parameters = ''
     if beside.is_file():
         parameters = beside.read_text(encoding='utf-8', errors='replace')
-    return Bag(str(path), size, changed_ns, parameters)
+    return BagFiles(str(path), size, changed_ns, parameters)
 
 
 def unique_names(paths: Sequence[str]) -> list[str]:
@@ -282,7 +282,7 @@ def make_jobs(
     version: str,
 ) -> list[Job]:
     """Jobs for bags, or globs of them; `parameters`: None for the file next to each bag."""
-    bags: list[Bag] = client.submit(find_bags, paths, pure=False).result()
+    bags: list[BagFiles] = client.submit(find_bags, paths, pure=False).result()
     if all(bag.size < 0 for bag in bags):
         raise MissingInputError(f'the workers find no bag at {", ".join(paths)}')
     names = unique_names([bag.path for bag in bags])

@@ -298,7 +298,7 @@ CHECK = Command(
 )
 
 
-class Source(NamedTuple):
+class RecordingFormat(NamedTuple):
     """A format of recordings that `convert` reads."""
 
     help: str
@@ -330,7 +330,7 @@ PHONES: Mapping[str, phone.Reader] = {
     'tables': phone.read_tables,
 }
 # The logger of a phone is recognised by its files. [derived: `FORMATS`]
-_PHONE = Source(
+_PHONE = RecordingFormat(
     "folder of a phone's logger, recognised by its files: "
     + '; '.join(str(one) for one in FORMATS if one.name in PHONES),
     'FOLDER',
@@ -338,8 +338,8 @@ _PHONE = Source(
 )
 
 # Formats of recordings by the name that the user types. [derived: interface]
-SOURCES: Mapping[str, Source] = {
-    'video': Source(
+SOURCES: Mapping[str, RecordingFormat] = {
+    'video': RecordingFormat(
         'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
         '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
         'FILE',
@@ -348,19 +348,19 @@ SOURCES: Mapping[str, Source] = {
     ),
     'phone': _PHONE,
     'android': _PHONE._replace(help='the same as phone'),
-    'euroc': Source(
+    'euroc': RecordingFormat(
         "folder in the format of EuRoC's MAV data set (mav0 with cam0, imu0, sensor.yaml); the "
         'camera may have a rolling shutter, as that of TUM RS-VI',
         'FOLDER',
         lambda folder, _: read_euroc(folder),
     ),
-    'realsense_rgb_rs': Source(
+    'realsense_rgb_rs': RecordingFormat(
         'colour camera, gyro and accelerometer of a RealSense, from '
         'github.com/Zoltan3057/DM-VIO-dataset (imu.txt, frames.csv, camera.txt, images/)',
         'FOLDER',
         _of_laboratory('read_realsense'),
     ),
-    'xiaomi_cc9_rs': Source(
+    'xiaomi_cc9_rs': RecordingFormat(
         'phone with gyro, from github.com/lhaippp/gyro-video-stabilization '
         '(gyro.txt, framestamp.txt, images/)',
         'FOLDER',

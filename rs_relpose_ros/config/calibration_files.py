@@ -53,7 +53,7 @@ _NOISE = {
 }
 
 
-class Calibration(NamedTuple):
+class ToolCalibration(NamedTuple):
     """Parameters from the file of another tool."""
 
     tool: str
@@ -71,7 +71,7 @@ def plain_yaml(text: str) -> str:
     return text.replace('!!opencv-matrix', '')
 
 
-def calibration_of(document: Any, path: str) -> Calibration | None:
+def calibration_of(document: Any, path: str) -> ToolCalibration | None:
     """Return the parameters in the document of a YAML file; None if it is of no known tool."""
     if not isinstance(document, dict):
         return None
@@ -158,16 +158,19 @@ def _is_chain(document: Mapping[str, Any]) -> bool:
     return isinstance(camera, Mapping) and 'intrinsics' in camera
 
 
-def _chain(document: Mapping[str, Any]) -> Calibration:
+def _pinhole(camera: Mapping[str, Any], coefficients: str) -> dict[str, Any]:
+    """Read the lens of a camera of Kalibr, OpenVINS or EuRoC, with the key of its distortion."""
+    model = str(camera.get('camera_model', 'pinhole'))
+    if model != 'pinhole':
+        raise InputError(f'the camera model {model} is not supported')
+    distortion = camera.get('distortion_model', 'none')
+    return _lens(distortion, camera['intrinsics'], camera.get(coefficients) or ())
+
+
+def _chain(document: Mapping[str, Any]) -> ToolCalibration:
     """Read the first camera of a chain of Kalibr or OpenVINS."""
     camera = document['cam0']
-    if str(camera.get('camera_model', 'pinhole')) != 'pinhole':
-        raise InputError(f'the camera model {camera["camera_model"]} is not supported')
-    values = _lens(
-        camera.get('distortion_model', 'none'),
-        camera['intrinsics'],
-        camera.get('distortion_coeffs') or (),
-    )
+    values = _pinhole(camera, 'distortion_coeffs')
     tool = 'camchain of Kalibr'
     if 'T_imu_cam' in camera:
         tool = 'camera chain of OpenVINS'
@@ -176,7 +179,7 @@ def _chain(document: Mapping[str, Any]) -> Calibration:
         values |= _extrinsics(_matrix(camera['T_cam_imu']))
     if 'timeshift_cam_imu' in camera:
         values['time_offset'] = float(camera['timeshift_cam_imu'])
-    return Calibration(f'{tool}, cam0', values, _size(camera.get('resolution')))
+    return ToolCalibration(f'{tool}, cam0', values, _size(camera.get('resolution')))
 
 
 def _is_imu(document: Mapping[str, Any]) -> bool:
@@ -185,16 +188,16 @@ def _is_imu(document: Mapping[str, Any]) -> bool:
     )
 
 
-def _imu(document: Mapping[str, Any]) -> Calibration:
+def _imu(document: Mapping[str, Any]) -> ToolCalibration:
     """Read the noise of an IMU as Kalibr, OpenVINS and EuRoC write it."""
-    return Calibration('noise of the IMU', _noise(document.get('imu0', document)))
+    return ToolCalibration('noise of the IMU', _noise(document.get('imu0', document)))
 
 
 def _is_orbslam(document: Mapping[str, Any]) -> bool:
     return 'Camera1.fx' in document or 'Camera.fx' in document
 
 
-def _orbslam(document: Mapping[str, Any]) -> Calibration:
+def _orbslam(document: Mapping[str, Any]) -> ToolCalibration:
     """Read the settings of ORB-SLAM3, of its first or its second format."""
     camera = 'Camera1' if 'Camera1.fx' in document else 'Camera'
     kind = str(document.get('Camera.type', 'PinHole'))
@@ -214,7 +217,7 @@ def _orbslam(document: Mapping[str, Any]) -> Calibration:
     if transform is not None:
         values |= _extrinsics(_inverse(_matrix(transform)))
     size = document.get('Camera.width'), document.get('Camera.height')
-    return Calibration(
+    return ToolCalibration(
         'settings of ORB-SLAM3',
         values | _noise(document),
         None if None in size else _size(size),
@@ -225,17 +228,11 @@ def _is_sensor(document: Mapping[str, Any]) -> bool:
     return 'intrinsics' in document and 'T_BS' in document
 
 
-def _sensor(document: Mapping[str, Any]) -> Calibration:
+def _sensor(document: Mapping[str, Any]) -> ToolCalibration:
     """Read sensor.yaml of a camera in a folder of EuRoC; the body is the IMU."""
-    if str(document.get('camera_model', 'pinhole')) != 'pinhole':
-        raise InputError(f'the camera model {document["camera_model"]} is not supported')
-    values = _lens(
-        document.get('distortion_model', 'none'),
-        document['intrinsics'],
-        document.get('distortion_coefficients') or (),
-    )
+    values = _pinhole(document, 'distortion_coefficients')
     values |= _extrinsics(_inverse(_matrix(document['T_BS'])))
-    return Calibration('sensor.yaml of EuRoC', values, _size(document.get('resolution')))
+    return ToolCalibration('sensor.yaml of EuRoC', values, _size(document.get('resolution')))
 
 
 def _is_ros(document: Mapping[str, Any]) -> bool:
@@ -243,14 +240,14 @@ def _is_ros(document: Mapping[str, Any]) -> bool:
     return isinstance(matrix, Mapping) and 'data' in matrix
 
 
-def _ros(document: Mapping[str, Any]) -> Calibration:
+def _ros(document: Mapping[str, Any]) -> ToolCalibration:
     """Read ost.yaml of camera_calibration, which has no IMU."""
     fx, _, cx, _, fy, cy, *_ = document['camera_matrix']['data']
     distortion = document.get('distortion_coefficients', {})
     model = document.get('distortion_model', 'plumb_bob')
     values = _lens(model, (fx, fy, cx, cy), distortion.get('data') or ())
     size = document['image_width'], document['image_height']
-    return Calibration('camera_calibration of ROS', values, _size(size))
+    return ToolCalibration('camera_calibration of ROS', values, _size(size))
 
 
 # Each tool has a test whether a document is its own, and a reader. [derived: the keys of the
@@ -258,7 +255,7 @@ def _ros(document: Mapping[str, Any]) -> Calibration:
 _TOOLS: tuple[
     tuple[
         Callable[[Mapping[str, Any]], bool],
-        Callable[[Mapping[str, Any]], Calibration],
+        Callable[[Mapping[str, Any]], ToolCalibration],
     ],
     ...,
 ] = (

@@ -19,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from rs_relpose_ros.config.calibration_files import Calibration, calibration_of, plain_yaml
+from rs_relpose_ros.config.calibration_files import calibration_of, plain_yaml, ToolCalibration
 from rs_relpose_ros.config.settings import ANY_VALUE, Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.output_files import written
@@ -142,7 +142,7 @@ def _text_of(path: Path) -> str:
         raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path) -> ToolCalibration:
     """Read the calibration file of another tool; InputError if it is none."""
     found = calibration_of(_document(_text_of(path), str(path)), str(path))
     if found is None:

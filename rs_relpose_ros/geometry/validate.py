@@ -46,7 +46,7 @@ def replaced(data: Data, **changes: Any) -> Data:
     return unchecked(type(data), **fields | changes)
 
 
-def legal_range(low: float, high: float, unit: str = '') -> str:
+def legal_range(low: float, high: float, unit: str) -> str:
     """Describe the numbers from `low` to `high` in words."""
     unit = f' {unit}'.rstrip()
     if -math.inf < low and high < math.inf:

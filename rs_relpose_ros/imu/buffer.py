@@ -16,14 +16,11 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.gyro import integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
+from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY, Vector
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps, to_nanoseconds
 from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
-
-Vector = tuple[float, float, float]
-
 
 # A step between samples of more than this many times the usual one: a sample may still arrive.
 # [derived: halfway between one step and two]

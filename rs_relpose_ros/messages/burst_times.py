@@ -21,10 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps
 from rs_relpose_ros.imu.buffer import EXACT, ImuSample, StampDoubt
-
-Stamps = NDArray[np.int64]
 
 # -- Bursts by their stamps -----------------------------------------------------------------------
 

@@ -23,11 +23,9 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.burst_times import Bursts, find_bursts, SampleTimes
-
-Stamps = NDArray[np.int64]
 
 # Stamps before this time are since the start of a device, those after it since 1970 [ns].
 # [derived: 10^9 s are 2001, and 31 years of running]
@@ -51,7 +49,7 @@ _FEWEST_STAMPS = 5
 _MOST_TIMED = 0.5
 
 
-class Kind(str, Enum):
+class FaultKind(str, Enum):
     """Kind of a fault of a stream."""
 
     BURSTS = 'bursts'
@@ -62,7 +60,7 @@ class Kind(str, Enum):
 class StreamFault(NamedTuple):
     """A fault of a stream, with a text and what to do."""
 
-    kind: Kind
+    kind: FaultKind
     message: str
     fix: str
     measured: Mapping[str, Any]
@@ -97,7 +95,7 @@ def burst_fault(topic: str, bursts: Bursts, sigma: float) -> StreamFault:
     else:
         message += ', and they come too unevenly for even times'
     measured = {'burst': bursts.size, 'rate_hz': bursts.rate, 'offset_sigma_s': sigma or None}
-    return StreamFault(Kind.BURSTS, message, fix, measured, withholds=not sigma)
+    return StreamFault(FaultKind.BURSTS, message, fix, measured, withholds=not sigma)
 
 
 def burst_warning(topic: str, times: SampleTimes) -> str:
@@ -126,7 +124,9 @@ def counter_unit(step: float, interval: float) -> str:
     return ''
 
 
-def check_timelines(timeline: Callable[[Any], Timeline], topics: Any) -> dict[Kind, StreamFault]:
+def check_timelines(
+    timeline: Callable[[Any], Timeline], topics: Any
+) -> dict[FaultKind, StreamFault]:
     """Return the faults of the streams of a bag by their kind, from the stamps of all messages.
 
     `timeline` of the bag; `topics` by role, None for one that it lacks.
@@ -162,13 +162,13 @@ def _since_boot(image: Timeline, imu: Timeline) -> list[StreamFault]:
     )
     fix = 'have both drivers stamp with one clock (ROS time)'
     measured = {'apart_s': (image_ns - imu_ns) * 1e-9}
-    return [StreamFault(Kind.SINCE_BOOT, message, fix, measured)]
+    return [StreamFault(FaultKind.SINCE_BOOT, message, fix, measured)]
 
 
 def _accel_clock(topic: str, ahead: float) -> StreamFault:
     side = 'ahead of' if ahead > 0.0 else 'behind'
     return StreamFault(
-        Kind.ACCEL_CLOCK,
+        FaultKind.ACCEL_CLOCK,
         f'the clock of the accelerometer ({topic}) is {abs(ahead):.1f} s {side} that of the gyro',
         'have its driver stamp both sensors with one clock; until then poses are from the gyro '
         'alone',

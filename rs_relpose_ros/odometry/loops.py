@@ -13,7 +13,7 @@ from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.states import Base, Odometry
-from rs_relpose_ros.pipeline.chosen_pairs import Stamps
+from rs_relpose_ros.pipeline.chosen_pairs import PairStamps
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # The smoothed keyframes of each start.
@@ -123,7 +123,7 @@ def close_loops(
     paths: Paths,
     views: Views,
     sensor: Sensor,
-    relate: Callable[[list[Stamps]], Sequence[PairResult]],
+    relate: Callable[[list[PairStamps]], Sequence[PairResult]],
 ) -> tuple[Paths, dict[str, Any], list[PublishedPair]]:
     """Add loops to smoothed paths; `relate`: results of pairs of image stamps.
 

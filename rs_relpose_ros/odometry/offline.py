@@ -24,7 +24,7 @@ from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.messages.published_pair import PublishedPair
-from rs_relpose_ros.messages.streams import check_timelines, Kind
+from rs_relpose_ros.messages.streams import check_timelines, FaultKind
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.loops import close_loops, Paths, Views
@@ -41,7 +41,7 @@ from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry, Odome
 from rs_relpose_ros.offline.replay import read_truth, related, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE, written
-from rs_relpose_ros.pipeline.chosen_pairs import Stamps
+from rs_relpose_ros.pipeline.chosen_pairs import PairStamps
 from rs_relpose_ros.pipeline.pair import PairResult
 
 # Colour and width of each path in the picture.
@@ -198,7 +198,7 @@ def _with_loops(
     parameters = replay.parameters
     assert replay.intake.intrinsics is not None
 
-    def relate(stamps: list[Stamps]) -> list[PairResult]:
+    def relate(stamps: list[PairStamps]) -> list[PairResult]:
         results, *_ = related(bag, topics, parameters, stamps)
         return [pair for pair in results if isinstance(pair, PairResult)]
 
@@ -360,7 +360,7 @@ def follow(
 
 def _require_accelerometer(bag: Bag, topics: SensorTopics) -> None:
     """InputError for an accelerometer on another clock, by which a path would be wrong."""
-    fault = check_timelines(bag.timeline, topics).get(Kind.ACCEL_CLOCK)
+    fault = check_timelines(bag.timeline, topics).get(FaultKind.ACCEL_CLOCK)
     if fault is not None:
         raise InputError(
             f'{bag.path}: {fault.message}, and a path needs both sensors: have their driver '

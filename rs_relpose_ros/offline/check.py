@@ -32,13 +32,18 @@ from rs_relpose_ros.messages.outgoing import LARGE_MESSAGE
 from rs_relpose_ros.messages.streams import (
     check_timelines,
     counter_unit,
+    FaultKind,
     find_multiplied,
-    Kind,
     StreamFault,
 )
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
+from rs_relpose_ros.offline.check_recording import (
+    Completion,
+    FrontEndSample,
+    Scan,
+    StampStatistics,
+)
 from rs_relpose_ros.offline.check_report import (
     by_case,
     Case,
@@ -175,7 +180,7 @@ _MOST_STAMPS = 1000
 _UNORDERED_SHARE = 0.2
 
 
-def _no_step(name: Code, stamps: Stamps, measured: dict[str, Any]) -> Line:
+def _no_step(name: Code, stamps: StampStatistics, measured: dict[str, Any]) -> Line:
     return property_line(
         name,
         WRONG,
@@ -185,7 +190,7 @@ def _no_step(name: Code, stamps: Stamps, measured: dict[str, Any]) -> Line:
     )
 
 
-def stamp_finding(name: Code, stamps: Stamps, of: str) -> Line:
+def stamp_finding(name: Code, stamps: StampStatistics, of: str) -> Line:
     """Order and evenness of stamps; those of images may follow an exposure."""
     varying = Varying.JITTER
     if of == 'the camera':
@@ -314,7 +319,7 @@ def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Line]:
     ]
 
 
-def _rate(stamps: Stamps) -> Line:
+def _rate(stamps: StampStatistics) -> Line:
     name = Code.IMAGE_RATE
     interval = stamps.interval
     duration = stamps.duration
@@ -449,7 +454,7 @@ _FASTEST_MEDIAN = 8.0
 
 
 def _imu(
-    scan: Scan, reliability: str, parameters: Parameters, faults: Mapping[Kind, StreamFault]
+    scan: Scan, reliability: str, parameters: Parameters, faults: Mapping[FaultKind, StreamFault]
 ) -> list[Line]:
     """Findings on the IMU by itself."""
     if not len(scan.rates):
@@ -464,16 +469,16 @@ def _imu(
             )
         ]
     stamps = scan.stamps(Role.IMU)
-    if Kind.BURSTS in faults:
+    if FaultKind.BURSTS in faults:
         # Steps, gaps and repeated stamps follow from the bursts.
-        bursts = faults[Kind.BURSTS]
+        bursts = faults[FaultKind.BURSTS]
         state = WRONG if bursts.withholds else SUSPECT
         lines = [_of_fault(Code.IMU_RATE, state, bursts)]
     else:
         rate = _imu_rate(scan, stamps, reliability, parameters.imu.max_imu_gap)
         lines = [rate, stamp_finding(Code.IMU_STAMPS, stamps, 'the IMU')]
-    if Kind.ACCEL_CLOCK in faults:
-        lines.append(_of_fault(Code.ACCEL_CLOCK, SUSPECT, faults[Kind.ACCEL_CLOCK]))
+    if FaultKind.ACCEL_CLOCK in faults:
+        lines.append(_of_fault(Code.ACCEL_CLOCK, SUSPECT, faults[FaultKind.ACCEL_CLOCK]))
     return [
         *lines,
         _gyro(scan),
@@ -487,7 +492,7 @@ def _of_fault(code: Code, state: FindingState, fault: StreamFault) -> Line:
     return property_line(code, state, fault.message, fault.fix, fault.measured)
 
 
-def _imu_rate(scan: Scan, stamps: Stamps, reliability: str, gap: float) -> Line:
+def _imu_rate(scan: Scan, stamps: StampStatistics, reliability: str, gap: float) -> Line:
     """Line on the steps of the IMU; those above `gap` [s] are not interpolated."""
     if not stamps.interval > 0.0:
         return _no_step(Code.IMU_RATE, stamps, {})
@@ -674,10 +679,10 @@ _SET_BY = {'quat_cam_imu_xyzw': Code.AXES, 'readout_time': Code.READOUT_TIME}
 
 def joint_findings(
     scan: Scan,
-    sample: Sample | None,
+    sample: FrontEndSample | None,
     completion: Completion,
     parameters: Parameters,
-    faults: Mapping[Kind, StreamFault],
+    faults: Mapping[FaultKind, StreamFault],
     offset: float | None = None,
 ) -> list[Line]:
     """Findings on both sensors together.
@@ -690,8 +695,8 @@ def joint_findings(
         health = _with_calibration(sample, scan, completion)
     has_poses = sample is not None and sample.poses > 0 and health.state is not WRONG
     found = [_overlap(scan, parameters, has_poses, offset)]
-    if Kind.SINCE_BOOT in faults:
-        found = [_of_fault(Code.CLOCKS, WRONG, faults[Kind.SINCE_BOOT])]
+    if FaultKind.SINCE_BOOT in faults:
+        found = [_of_fault(Code.CLOCKS, WRONG, faults[FaultKind.SINCE_BOOT])]
     clocks_differ = 'the clocks differ' if offset is not None else ''
     causes = [fault.message for fault in faults.values() if fault.withholds]
     why = clocks_differ or next(iter(causes), '')
@@ -702,7 +707,7 @@ def joint_findings(
     reason = completion.problem if sample is None else 'too few pairs of images were estimated'
     missing = {_SET_BY[name] for name in parameters.sensor.missing()}
     found += [_not_configured(code, completion, scan) for code in sorted(missing)]
-    bursts = faults.get(Kind.BURSTS)
+    bursts = faults.get(FaultKind.BURSTS)
     doubt = bursts.measured['offset_sigma_s'] if bursts else None
     lines = quantity_findings(health, clocks_differ or reason, doubt or 0.0)
     found += [line for line in lines if line.code not in missing]
@@ -723,9 +728,7 @@ def _offset_of_clocks(
     return None
 
 
-def _overlap(
-    scan: Scan, parameters: Parameters, has_poses: bool, offset: float | None = None
-) -> Line:
+def _overlap(scan: Scan, parameters: Parameters, has_poses: bool, offset: float | None) -> Line:
     """Whether the gyro covers the images in time, as stamped.
 
     If there are poses the stamps are right, and a difference of the delays is that of delivery.
@@ -778,7 +781,7 @@ def _overlap(
     )
 
 
-def _pairs(sample: Sample, health: Assessment) -> Line:
+def _pairs(sample: FrontEndSample, health: Assessment) -> Line:
     pairs = len(sample.matches)
     posed = sample.poses
     reason = next(iter(sample.reasons.most_common()), 'too few images were processed')
@@ -809,7 +812,7 @@ def _pairs(sample: Sample, health: Assessment) -> Line:
     )
 
 
-def _texture(sample: Sample, health: Assessment) -> Line:
+def _texture(sample: FrontEndSample, health: Assessment) -> Line:
     if not sample.matches:
         return property_line(
             Code.TEXTURE, UNKNOWN, 'not measured: there is no pair of images', '', {}
@@ -840,7 +843,7 @@ def _texture(sample: Sample, health: Assessment) -> Line:
     )
 
 
-def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Assessment:
+def _with_calibration(sample: FrontEndSample, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found = completion.found
     health = sample.health

@@ -66,7 +66,7 @@ _DECODED = 40
 _MOST_ENCODINGS = 20
 
 
-class Stamps:
+class StampStatistics:
     """Stamps (N,) of a topic [ns], in the order of recording, and how much later [s] that was."""
 
     def __init__(self, stamps_ns: Sequence[int], recorded_ns: Sequence[int]) -> None:
@@ -165,9 +165,9 @@ class Scan:
         if self.configured.given:
             self.intrinsics = self.configured.of_image(width, height)
 
-    def stamps(self, role: Role) -> Stamps:
+    def stamps(self, role: Role) -> StampStatistics:
         """Stamps so far of the images or of the IMU, without those of a separate accelerometer."""
-        return Stamps(*self._stamps[role])
+        return StampStatistics(*self._stamps[role])
 
     @cached_property
     def rates(self) -> Array:
@@ -401,7 +401,7 @@ def _offset_of_row(found: CalibrationResult, stamp_row: str) -> float:
     return found.time_offset.value + share * found.readout_time.value
 
 
-class Sample(NamedTuple):
+class FrontEndSample(NamedTuple):
     """What the front end made of parts of a recording."""
 
     frames: int
@@ -426,7 +426,7 @@ class Sample(NamedTuple):
 
 def sampled(
     source: Iterable[tuple[Role, BagMessage]], images: int, parameters: Parameters
-) -> Sample:
+) -> FrontEndSample:
     """Parts of a recording of so many `images` through the front end.
 
     Parameters are used as configured: nothing is tracked, nothing is suppressed.
@@ -470,7 +470,9 @@ def sampled(
         last_ns = pair.stamp_ns
     health = with_maps(findings.worst_of(before, front_end.health), residuals.maps())
     is_refused = frames < _FEW_USED * counts['handed']
-    return Sample(frames, matches, poses, poseless if matches else unused, health, is_refused)
+    return FrontEndSample(
+        frames, matches, poses, poseless if matches else unused, health, is_refused
+    )
 
 
 def _of_parts(

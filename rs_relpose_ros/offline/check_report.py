@@ -152,7 +152,7 @@ class CheckReport:
         number = f'{len(doubts)} warnings, the first: ' if len(doubts) > 1 else ''
         return f'{self.bag} can be used; {number}{doubts[0].text}'
 
-    def lines(self, width: int = 100) -> list[str]:
+    def lines(self, width: int) -> list[str]:
         """The report as text of at most `width` columns, but for the first and the last line.
 
         What follows from a finding is indented below it.

@@ -113,9 +113,7 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     _save_over_time(picture, path)
 
 
-def draw_rotation(
-    records: Sequence[PairRecord], path: Path, truth: TrueTrajectory | None = None
-) -> None:
+def draw_rotation(records: Sequence[PairRecord], path: Path, truth: TrueTrajectory | None) -> None:
     """Rotation accumulated over the pairs, against the ground truth or else the gyro."""
     chains = _chains(records, truth)
     against = list(chains)[-1]  # the ground truth, or else the gyro

@@ -40,7 +40,7 @@ from rs_relpose_ros.offline import tables
 from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
-from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
+from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, PairStamps
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused
@@ -394,7 +394,7 @@ CHOSEN_POSES = tables.Table(
 )
 
 
-def read_pairs(path: Path) -> list[Stamps]:
+def read_pairs(path: Path) -> list[PairStamps]:
     """Stamps [ns] of the earlier and of the later image of each pair in a list (CSV)."""
     with check_file(path).open(newline='', encoding='utf-8-sig', errors='replace') as file:
         rows = csv.DictReader(file)
@@ -409,7 +409,11 @@ def read_pairs(path: Path) -> list[Stamps]:
 
 
 def pairs_into(
-    folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, pairs: Sequence[Stamps]
+    folder: Path,
+    bag: Bag,
+    topics: SensorTopics,
+    parameters: Parameters,
+    pairs: Sequence[PairStamps],
 ) -> ReplayOutcome:
     """Write a row for each of the pairs, in their order, into tables in `folder`."""
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE))
@@ -437,14 +441,14 @@ def pairs_into(
 
 
 def related(
-    bag: Bag, topics: SensorTopics, parameters: Parameters, pairs: Sequence[Stamps]
+    bag: Bag, topics: SensorTopics, parameters: Parameters, pairs: Sequence[PairStamps]
 ) -> tuple[list[PairResult | str], Intrinsics | None]:
     """Results of the pairs, or the reasons why they were not estimated; active intrinsics."""
     warm_up(parameters.estimator)
     wanted = [pair for pair in pairs if pair[0] < pair[1]]
     loop = FrameLoop(parameters, ChosenPairs(wanted), offline=True)
     intake = Intake(loop.sequencer, parameters, {stamp for pair in wanted for stamp in pair})
-    results: dict[Stamps, PairResult | str] = {}
+    results: dict[PairStamps, PairResult | str] = {}
     problems: dict[int, str] = {}
     for outcome in outcomes(loop, intake, sensor_messages(bag, topics)):
         if isinstance(outcome, Frame):

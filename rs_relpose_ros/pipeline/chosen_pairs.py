@@ -141,7 +141,7 @@ def _since(
 
 
 # Stamps of the earlier and of the later image of a pair [ns].
-Stamps = tuple[int, int]
+PairStamps = tuple[int, int]
 Kept = TypeVar('Kept')
 
 
@@ -150,14 +150,14 @@ def _after(first_ns: int, by_stamp: dict[int, Kept]) -> dict[int, Kept]:
     return {stamp_ns: one for stamp_ns, one in by_stamp.items() if stamp_ns > first_ns}
 
 
-class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
+class ChosenPairs(Processor[dict[PairStamps, PairResult | str]]):
     """Estimates the `wanted` pairs: results by their stamps, or the reasons for none.
 
     A frame is kept until the last of its pairs, the frames after it for `max_keyframe_interval`,
     and the IMU data of all frames since the oldest frame that is kept.
     """
 
-    def __init__(self, wanted: Collection[Stamps]) -> None:
+    def __init__(self, wanted: Collection[PairStamps]) -> None:
         self._wanted = frozenset(wanted)
         # Stamp of the last frame that each first frame is related to.
         self._last = dict(sorted(self._wanted))
@@ -174,7 +174,7 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
 
     def process(
         self, frame: Frame[Any], parameters: Parameters
-    ) -> dict[Stamps, PairResult | str] | None:
+    ) -> dict[PairStamps, PairResult | str] | None:
         """The pairs of this frame with earlier ones."""
         current_ns = frame.stamp_ns
         self._imus[current_ns] = frame.imu

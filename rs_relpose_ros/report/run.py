@@ -39,7 +39,7 @@ from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.messages.streams import check_timelines, Timeline
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check, check_recording
-from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan
+from rs_relpose_ros.offline.check_recording import Completion, FrontEndSample, Scan
 from rs_relpose_ros.offline.check_report import Line, with_parents
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, unused_reason
 from rs_relpose_ros.offline.tables import PairRecord
@@ -57,7 +57,7 @@ SHOWN_FRAMES = 4
 _FEW_USED = 0.1
 
 
-class Rotation(NamedTuple):
+class CameraRotation(NamedTuple):
     """Rotation of the camera over some frames, as images show it."""
 
     stamp_ns: int  # of the last frame
@@ -99,7 +99,7 @@ class Observation:
     pairs: tuple[PairRecord, ...] = ()
     withheld: int = 0  # pairs with a pose that a node would not publish
     residuals: tuple[MatchResiduals, ...] = ()  # of the pairs with a pose
-    rotations: tuple[Rotation, ...] = ()
+    rotations: tuple[CameraRotation, ...] = ()
     shown: tuple[PairResult, ...] = ()
     health: Assessment = NOT_EVALUATED
     maps: tuple[ResidualMap, ...] = ()  # of their signed residuals
@@ -200,7 +200,7 @@ class _Run:
         self.intake = Intake(self._front_end.sequencer, parameters)
         self._part = max(images // SHOWN_FRAMES, 1)
         self._best: dict[int, PairResult] = {}
-        self._rotations: dict[int, Rotation] = {}
+        self._rotations: dict[int, CameraRotation] = {}
         self.records: list[PairRecord] = []
         self.residuals: list[MatchResiduals] = []
         self._residual_maps = ResidualMaps()
@@ -249,7 +249,7 @@ class _Run:
             self._poseless.add(pair.pose.reason)
         self._note_health(pair.health)
         for stamp, interval, by_images, _ in self._front_end.rotations:
-            self._rotations[stamp] = Rotation(stamp, interval, by_images)
+            self._rotations[stamp] = CameraRotation(stamp, interval, by_images)
         self._keep_best(pair)
         return published if self._parameters.pair.withhold_when_wrong else pair
 
@@ -275,7 +275,7 @@ class _Run:
         return tuple(self._best[part] for part in sorted(self._best))
 
     @property
-    def rotations(self) -> tuple[Rotation, ...]:
+    def rotations(self) -> tuple[CameraRotation, ...]:
         """All rotations by images, in the order of time."""
         return tuple(self._rotations[stamp] for stamp in sorted(self._rotations))
 
@@ -294,10 +294,10 @@ class _Run:
             unused=dict(self.unused.most_common()),
         )
 
-    def sample(self, images: int) -> Sample:
+    def sample(self, images: int) -> FrontEndSample:
         """The run, as `check` makes its findings of it."""
         poses = sum(bool(record.pose) for record in self.records)
-        return Sample(
+        return FrontEndSample(
             self.frames,
             [int(record.metrics['matches']) for record in self.records],
             poses,

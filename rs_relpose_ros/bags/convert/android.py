@@ -34,7 +34,8 @@ from rs_relpose_ros.bags.convert.text_files import (
 )
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.geometry.so3 import Vector
+from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import TruePose
 
 _logger = logging.getLogger(__name__)

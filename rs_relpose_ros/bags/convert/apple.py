@@ -33,8 +33,8 @@ from rs_relpose_ros.bags.convert.text_files import (
 from rs_relpose_ros.bags.convert.video import Video
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
-from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY, Vector
+from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.imu.integration import interpolated
 from rs_relpose_ros.messages.incoming import TruePose
 

@@ -69,9 +69,9 @@ def phone_recording(
     details: str,
     images: Sequence[RecordedImage],
     imu: Sequence[ImuSample],
-    accel: Sequence[ImuSample] = (),
-    values: Sequence[SourcedValue] = (),
-    axes: SourcedValue | None = None,
+    accel: Sequence[ImuSample],
+    values: Sequence[SourcedValue],
+    axes: SourcedValue | None,
     *,
     orientation: int | None = None,
 ) -> Recording:

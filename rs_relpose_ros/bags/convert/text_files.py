@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.so3 import Vector
 from rs_relpose_ros.geometry.timing import END_OF_STAMPS_NS, NANOSECONDS
-from rs_relpose_ros.imu.buffer import Vector
 
 # A larger table is refused: reading it would fill the memory. [chosen: an hour of an IMU at
 # 1 kHz has 4e8 bytes at most in any known logger; any value from 1e8 to 1e10 would do]

@@ -19,8 +19,9 @@ from rs_relpose_ros.bags.convert.text_files import check_file, read_object
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.so3 import Vector
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
-from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.imu.buffer import ImuSample
 
 # The first frame is stamped with this time [ns], because the file has no clock. [chosen: samples
 # can precede the first frame by seconds; any value from 100 s to years would do]
