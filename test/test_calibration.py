@@ -28,7 +28,8 @@ from rs_relpose_ros.calibration import fit as fitting
 from rs_relpose_ros.calibration import knowledge, model, observations
 from rs_relpose_ros.calibration.errors import (
     fit,
-    jackknife,
+    Groups,
+    of_few_groups,
     stretches,
     weights_of_stretches,
     widened,
@@ -769,14 +770,17 @@ def test_a_part_of_the_image_that_is_wrong_widens_the_sigmas():
     assert wider(final).max() > 2.0 * wider(undisturbed()[0]).max()
 
 
-def test_halves_that_disagree_widen_the_sigmas():
+def test_a_change_within_the_recording_widens_the_sigmas():
     gyro = recorded().gyro
     rates = gyro.rates.copy()
     rates[gyro.stamps_ns > recorded().tracks.stamps_ns[50]] += [0.03, 0.0, 0.0]
     final, _ = fitted(free_of(EXPOSURE), gyro=GyroSeries(gyro.stamps_ns, rates))
-    covariance = widened(final).covariance
-    # The bias is 0.015 rad/s from the mean in each half.
-    assert np.sqrt(covariance[BIAS, BIAS]) > 5e-3
+    found = widened(final)
+    right = widened(undisturbed()[0])
+    # Blocks that are 0.015 rad/s from the mean have it within 0.005, with equal weights.
+    sigma, undisturbed_sigma = (np.sqrt(one.covariance[BIAS, BIAS]) for one in (found, right))
+    assert sigma > max(2e-3, 2.0 * undisturbed_sigma)
+    assert found.halves_apart > 2.0 * right.halves_apart
 
 
 def test_a_wrong_claim_of_the_camera_info_is_named_and_not_put_on_the_axes():
@@ -1113,10 +1117,12 @@ def test_stretches_of_a_simulated_camera_agree(tmp_path):
 def mean_of(samples: np.ndarray, groups: np.ndarray) -> tuple[float, float]:
     """Mean and its sigma: the score of sample x is mean - x, its curvature 1."""
     mean = float(samples.mean())
-    covariance = jackknife(
-        (mean - samples)[:, None], np.ones((len(samples), 1, 1)), groups, np.zeros((1, 1))
-    )
-    return mean, math.sqrt(covariance[0, 0])
+    names = np.unique(groups)
+    scores = np.array([(mean - samples[groups == name]).sum() for name in names])[:, None]
+    curvatures = np.array([np.count_nonzero(groups == name) for name in names], dtype=float)
+    whole = np.array([[float(len(samples))]])
+    variances = Groups(scores, curvatures[:, None, None], whole).jackknife()
+    return mean, math.sqrt(variances[0])
 
 
 def test_jackknife_of_single_samples_is_the_variance_of_the_mean():
@@ -1138,11 +1144,47 @@ def test_jackknife_covers_errors_that_a_group_has_in_common():
     assert 0.61 < inside / 400 < 0.75
 
 
-def test_prior_counts_as_known():
-    covariance = jackknife(
-        np.zeros((10, 1)), np.zeros((10, 1, 1)), np.arange(10), np.array([[4.0]])
-    )
-    assert covariance[0, 0] == pytest.approx(0.25)
+def test_jackknife_leaves_one_group_out_each():
+    """Exact for a linear fit: the optimum without a group is that of the fit to the others."""
+    rng = np.random.default_rng(7)
+    groups = np.repeat(np.arange(6), 8)
+    A, y = rng.normal(size=(48, 3)), rng.normal(size=48)
+    whole = np.linalg.lstsq(A, y, rcond=None)[0]
+    parts = [np.flatnonzero(groups == g) for g in range(6)]
+    moves = [
+        np.linalg.lstsq(np.delete(A, part, axis=0), np.delete(y, part), rcond=None)[0] - whole
+        for part in parts
+    ]
+    scores = np.array([A[part].T @ (A[part] @ whole - y[part]) for part in parts])
+    curvatures = np.array([A[part].T @ A[part] for part in parts])
+    found = Groups(scores, curvatures, A.T @ A).jackknife()
+    np.testing.assert_allclose(found, of_few_groups(6) * (np.array(moves) ** 2).sum(axis=0))
+
+
+@pytest.mark.parametrize(('shift', 'least', 'most'), [(0.0, 0.5, 1.2), (1.5, 7.0, 9.0)])
+def test_halves_are_apart_if_what_is_measured_changes(shift, least, most):
+    """Sixty times a mean of ten groups, whose second half has moved."""
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(60):
+        values = rng.normal(size=10) + shift * np.repeat([-1.0, 1.0], 5)
+        scores, curvatures = (values.mean() - values)[:, None], np.ones((10, 1, 1))
+        groups = Groups(scores, curvatures, np.array([[10.0]]))
+        found.append(groups.halves_apart(1.0))
+    assert least < np.mean(found) < most
+
+
+def test_halves_are_not_apart_for_what_only_a_prior_determines_in_each():
+    """A slope over an abscissa that is constant within each half; its prior is off by a sigma."""
+    rng = np.random.default_rng(9)
+    at = np.repeat([-1.0, 1.0], 5)
+    A = np.stack([np.ones(10), at], axis=1)
+    values = 1.0 * at + 0.01 * rng.normal(size=10)
+    information = 1e4 * A[:, :, None] * A[:, None, :]
+    hessian = information.sum(axis=0) + np.diag([0.0, 1.0])
+    whole = np.linalg.solve(hessian, 1e4 * A.T @ values)
+    scores = 1e4 * (A @ whole - values)[:, None] * A
+    assert Groups(scores, information, hessian).halves_apart(1.0) < 2.0
 
 
 def test_stretches_last_a_second_but_are_ten_at_least():

@@ -38,8 +38,8 @@ _IMPOSSIBLE = 4.0
 # limited to that of 3 sigmas. [derived: p = 1e-5 of chi-square over the 18 parameters of a fit is
 # 3.0]
 _HALVES_APART = 3.5
-# Factor of the variance of a value by the scatter of regions of the image, beyond which they
-# contradict each other. [measured: at most 2 of correct recordings and real ones]
+# Variance of a value by regions of the image over that by time and model, beyond which regions
+# contradict each other. [derived: three sigmas; measured: at most 3.9 on ten correct recordings]
 _REGIONS_APART = 9.0
 # Noise of the mean rate of the gyro over an interval between frames, as a share of the rms of its
 # rate, beyond which the rows of an image see another rotation than the gyro. The readout time is

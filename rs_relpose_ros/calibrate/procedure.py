@@ -601,8 +601,7 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     """The calibration without sigmas of claimed parameters that are larger than their priors'.
 
     Widened, sigmas may exceed those of the priors. The information that is then missing is added
-    in these directions alone: the prior does not count twice. The values move by the correlations
-    of the Hessian: those of few stretches of time have fewer dimensions than there are parameters.
+    in these directions alone: the prior does not count twice.
     """
     prior = final.problem.prior
     is_known = knowledge.CLAIMED & final.free & (np.diag(prior) > 0.0)
@@ -610,9 +609,8 @@ def within_priors(final: fit.Fit, covariance: Array) -> tuple[model.Unknowns, Ar
     if not len(known):
         return final.unknowns, covariance
     off = final.problem.center[known] - final.unknowns.parameters[known]
-    step = _prior_gain(prior, known, errors.shaped(final, covariance)) @ off
-    narrower = _prior_gain(prior, known, covariance) @ covariance[:, known].T
-    return fit.stepped(final.unknowns, step), covariance - narrower
+    gain = _prior_gain(prior, known, covariance)
+    return fit.stepped(final.unknowns, gain @ off), covariance - gain @ covariance[:, known].T
 
 
 def _prior_gain(prior: Array, known: NDArray[np.int64], covariance: Array) -> Array:

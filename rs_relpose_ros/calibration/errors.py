@@ -1,14 +1,12 @@
 """Covariance of a calibration: noise, and errors that a fit to one recording cannot average out.
 
-Steps 2 to 4 of docs/calibration.md, "Method": noise of matches by a jackknife over stretches of
-time; errors that regions of the image share (two-way clustering: A. C. Cameron, J. B. Gelbach,
-D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the recording do not share
-(R. T. Birge, Phys. Rev. 40, 1932); errors of the priors, and of p1 and p2.
+Step 3 of docs/calibration.md, "Method": noise of the matches by the model, by a jackknife over
+blocks of time and by one over regions of the image, the largest of which counts; errors of the
+priors, and of p1 and p2.
 """
 
 from dataclasses import replace
-import math
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +24,9 @@ from rs_relpose_ros.calibration.fit import (
     TOLERANCE,
 )
 from rs_relpose_ros.calibration.knowledge import TANGENTIAL_SIGMA
-from rs_relpose_ros.calibration.model import GLOBAL, Problem, ROTATION, Unknowns
-from rs_relpose_ros.core.least_squares import (
-    adjusted_scores,
-    grouped_covariance,
-    inverse,
-    JACKKNIFE,
-)
+from rs_relpose_ros.calibration.model import GLOBAL, Problem, Unknowns
+from rs_relpose_ros.core.least_squares import adjusted_scores, inverse, JACKKNIFE
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import log_so3
 
 # -- Noise of the matches -------------------------------------------------------------------------
 
@@ -50,6 +42,10 @@ _MOST_STRETCHES = 30
 # Least duration [s] that times are divided by, of pairs at one time.
 # [chosen: any value below the interval of frames would do]
 _LEAST_DURATION = 1e-9
+# Blocks of time of the jackknife. Errors that last for seconds, as of a scene or a motion, are in
+# one block; more blocks would share them, fewer leave a scatter that is hardly known.
+# [chosen: Student's t of 9 degrees of freedom widens by 6 %; 8 to 15 would do]
+_BLOCKS = 10
 # Multiple of the Newton step that is left, which the sigmas of a fit that has not converged
 # contain. [chosen: that by which steps are extended at most]
 _OF_LEFT = 8.0
@@ -68,19 +64,10 @@ def fit(
     After `rounds` the sigmas contain what may be left to the optimum.
     """
     found = minimised(problem, unknowns, free, rounds=rounds, tolerance=tolerance)
-    at, prior = found.evaluation, problem.prior[found.block]
-    curvatures = bent(found.weights) * at.reduced
-    of_free = jackknife(at.score, curvatures, stretches(problem.middles), prior)
-    # Few stretches may scatter less than independent matches would: the larger one counts.
-    inverse_curvature = inverse(curvatures.sum(axis=0) + prior)
-    of_prior = inverse_curvature @ prior @ inverse_curvature
-    of_noise = of_free - of_prior
-    # A weight counts once in the information, and twice in the variance of a score.
-    scatter = np.einsum('p,pij->ij', problem.weight, at.reduced)
-    formal = inverse_curvature @ scatter @ inverse_curvature
-    scattered = np.maximum(np.diag(of_noise), np.finfo(float).tiny)
-    wider = np.sqrt(np.maximum(np.diag(formal) / scattered, 1.0))
-    of_free = of_noise * np.outer(wider, wider) + of_prior
+    by_prior = _by_prior(found)[free]
+    of_model = _of_model(found)
+    of_time = Groups.of_time(found).jackknife()
+    of_free = _widened_to(of_model, of_time) + by_prior @ by_prior.T
     if not found.converged:
         of_free += _OF_LEFT**2 * np.outer(found.left, found.left)
     covariance = np.zeros((GLOBAL, GLOBAL))
@@ -88,12 +75,126 @@ def fit(
     return replace(found, covariance=covariance)
 
 
-def stretches(times: Array) -> NDArray[np.int64]:
-    """Stretch (P,) of the recording that each time (P,) [s] belongs to."""
+def _hessian(final: Fit) -> Array:
+    """Hessian (k, k) of the free parameters, with the curvature of the loss and the prior."""
+    return np.asarray(bent(final.weights) * final.information + final.problem.prior[final.block])
+
+
+def _of_model(final: Fit) -> Array:
+    """Covariance (k, k) of the optimum if matches are as independent as their weights say."""
+    # A weight counts once in the information, and twice in the variance of a score.
+    scatter = np.einsum('p,pij->ij', final.problem.weight, final.evaluation.reduced)
+    covariance = inverse(_hessian(final))
+    return np.asarray(covariance @ scatter @ covariance)
+
+
+def _widened_to(covariance: Array, variances: Array) -> Array:
+    """The covariance (k, k) with at least these variances (k,) and the same correlations."""
+    own = np.maximum(np.diag(covariance), np.finfo(float).tiny)
+    wider = np.sqrt(np.maximum(variances / own, 1.0))
+    return np.asarray(covariance * np.outer(wider, wider))
+
+
+class Groups(NamedTuple):
+    """Sums of a fit over G groups of its matches, by its k free parameters.
+
+    Without one of them the optimum is a Newton step away: no fit is made.
+    """
+
+    scores: Array  # (G, k)
+    curvatures: Array  # (G, k, k), with the curvature of the loss
+    hessian: Array  # (k, k) of all, with the prior
+
+    @classmethod
+    def of(cls, final: Fit, scores: Array, curvatures: Array) -> Self:
+        """Groups whose curvatures are those of Gauss-Newton."""
+        return cls(scores, bent(final.weights) * curvatures, _hessian(final))
+
+    @classmethod
+    def of_time(cls, final: Fit) -> Self:
+        """The blocks of time."""
+        at, block = final.evaluation, blocks_of_time(final.problem.middles)
+        names = np.unique(block)
+        scores = np.stack([at.score[block == name].sum(axis=0) for name in names])
+        reduced = np.stack([at.reduced[block == name].sum(axis=0) for name in names])
+        return cls.of(final, scores, reduced)
+
+    @classmethod
+    def of_image(cls, final: Fit) -> Self:
+        """The regions of the image: what the sums of the pairs lack without the matches there."""
+        problem, unknowns, free = final.problem, final.unknowns, final.free
+        region = _regions(problem.points[0])
+        sums = sums_of(problem, unknowns, free)
+        whole = evaluation(problem, unknowns, sums)
+        scores, curvatures = [], []
+        for name in np.unique(region):
+            of_region = sums_of(problem.matches(region == name), unknowns, free)
+            others = sums._replace(
+                gradient=sums.gradient - of_region.gradient,
+                hessian=sums.hessian - of_region.hessian,
+            )
+            rest = evaluation(problem, unknowns, others)
+            scores.append((whole.score - rest.score).sum(axis=0))
+            curvatures.append((whole.reduced - rest.reduced).sum(axis=0))
+        return cls.of(final, np.array(scores), np.array(curvatures))
+
+    def jackknife(self) -> Array:
+        """Variances (k,) by leaving out one group each, without the errors of the prior.
+
+        Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the
+        few groups (B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11).
+        """
+        # Scores add up to the pull of the prior, which is no scatter.
+        scatter = self.scores - self.scores.mean(axis=0)
+        adjusted = adjusted_scores(scatter, self.curvatures, self.hessian, JACKKNIFE)
+        moves = adjusted @ inverse(self.hessian)
+        return np.asarray(of_few_groups(len(moves)) * (moves**2).sum(axis=0))
+
+    def halves_apart(self, variance: float) -> float:
+        """How far the first and the last groups are apart, each fitted without the others.
+
+        Mean over the parameters of the squared difference, in sigmas: those of the model, whose
+        scores have `variance` times their curvature, or by the scatter of the groups within their
+        halves. A difference of 3 sigmas and more counts as 3. Errors of the prior count as far as
+        they move the halves apart.
+        """
+        count = len(self.scores)
+        middle = (count + 1) // 2
+        inverses, optima, variances = [], [], np.zeros(self.scores.shape[1])
+        for half, other in (
+            (slice(0, middle), slice(middle, count)),
+            (slice(middle, count), slice(0, middle)),
+        ):
+            own = inverse(self.hessian - self.curvatures[other].sum(axis=0))
+            of_model = own @ (variance * self.curvatures[half].sum(axis=0)) @ own
+            within = (self.scores[half] - self.scores[half].mean(axis=0)) @ own
+            scatter = (within**2).sum(axis=0) * len(within) / max(len(within) - 1, 1)
+            variances += np.maximum(np.diag(of_model), scatter)
+            inverses.append(own)
+            optima.append(own @ self.scores[other].sum(axis=0))
+        apart = inverses[0] - inverses[1]
+        prior = self.hessian - self.curvatures.sum(axis=0)
+        variances += np.diag(apart @ prior @ apart)
+        squares = (optima[0] - optima[1]) ** 2 / variances
+        return float(np.minimum(squares, _GROSS).mean())
+
+
+def blocks_of_time(times: Array) -> NDArray[np.int64]:
+    """Block (P,) of the recording that each time (P,) [s] belongs to."""
+    return _parts(times, _BLOCKS)
+
+
+def _parts(times: Array, count: int) -> NDArray[np.int64]:
+    """Which of equally long parts of the recording each time (P,) [s] belongs to."""
     begin, duration = times.min(), max(float(np.ptp(times)), _LEAST_DURATION)
-    count = int(np.clip(duration / _STRETCH, _LEAST_STRETCHES, _MOST_STRETCHES))
     numbers = ((times - begin) / duration * count).astype(np.int64)
     return np.minimum(numbers, count - 1)
+
+
+def stretches(times: Array) -> NDArray[np.int64]:
+    """Stretch (P,) of the recording that each time (P,) [s] belongs to."""
+    duration = float(np.ptp(times))
+    return _parts(times, int(np.clip(duration / _STRETCH, _LEAST_STRETCHES, _MOST_STRETCHES)))
 
 
 # Multiple of the median misfit of the stretches from which one has less weight. A smaller one
@@ -163,22 +264,6 @@ def _misfit_of(found: Fit, part: NDArray[np.bool_]) -> float:
     return float(squares.mean()) / weight
 
 
-def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64], prior: Array) -> Array:
-    """Covariance (k, k) by deleting a group each: one Newton step from the optimum.
-
-    Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the few
-    groups (B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). `scores`
-    (P, k): gradients of the cost by pair; `curvatures` (P, k, k): their derivatives; `prior`
-    (k, k): information that counts as known.
-    """
-    names = np.unique(groups)
-    sums = np.stack([scores[groups == name].sum(axis=0) for name in names])
-    of_groups = np.stack([curvatures[groups == name].sum(axis=0) for name in names])
-    # Scores add up to the pull of the prior, which is no scatter.
-    scatter = math.sqrt(of_few_groups(len(names))) * (sums - sums.mean(axis=0))
-    return np.asarray(grouped_covariance(scatter, of_groups, prior, JACKKNIFE))
-
-
 def of_few_groups(count: int) -> float:
     """Factor of the variance of a jackknife over a number of groups.
 
@@ -201,15 +286,9 @@ def bent(weights: Array) -> float:
 _COLUMNS = 4
 # Rows of these regions. [chosen: as the regions of a pair, by the shape of an image]
 _ROWS = 3
-# Mean squared difference, in sigmas, of the parameters of two halves that is chance.
-# [derived: the 95 % quantile of chi-square over its degrees of freedom, for the ten to twelve
-# parameters of a fit, is 1.75 to 1.83]
-_CHANCE = 1.75
-# Squared difference of one parameter that is no chance. [chosen: 3 sigmas]
+# Squared difference of a parameter between two halves, in sigmas, beyond which it counts no more:
+# a single one would decide. [chosen: 3 sigmas]
 _GROSS = 9.0
-# Rounds of the fit of each half, from the optimum of the whole.
-# [chosen: a fit of a half takes five to ten]
-_HALF_ROUNDS = 15
 
 
 # Share of the sigma of a single pair that all pairs from images have in common, and that is not
@@ -222,24 +301,31 @@ _SHARED = 0.06
 def widened(final: Fit, *, in_images: bool = False) -> Fit:
     """The fit with a covariance of all errors, not only the noise of the matches.
 
-    The errors of the priors, which recordings of one camera share, are no scatter: regions and
-    halves do not widen them. `in_images` is whether a tracker followed the points: its own errors,
-    and p1 and p2 of the lens, which no fit estimates, are added.
+    The variance by the matches is the largest of three: that of the model, of the jackknife over
+    blocks of time (both are in the covariance of `fit`), and of that over regions of the image.
+    The errors of the priors, which recordings of one camera share, are no scatter.
+    `in_images` is whether a tracker followed the points: its own errors, and p1 and p2 of the
+    lens, which no fit estimates, are added.
     """
+    free, block = final.free, final.block
     by_prior = _by_prior(final)
-    of_noise = final.covariance - by_prior @ by_prior.T
-    of_halves, apart = _disagreement(final, of_noise)
-    of_regions = _between_regions(final, of_noise)
-    wider = np.sqrt(of_regions * of_halves)
+    covariance = final.covariance - by_prior @ by_prior.T
+    of_image = Groups.of_image(final).jackknife()
+    regions = np.ones(GLOBAL)
+    regions[free] = of_image / np.diag(covariance)[free]
+    covariance[block] = _widened_to(covariance[block], of_image)
     by_tangential = np.zeros((GLOBAL, 2))
-    shared = 1.0
     if in_images:
-        by_tangential[final.free] = _by_tangential(final, TANGENTIAL_SIGMA)
-        shared += _SHARED**2 * final.problem.pairs
+        by_tangential[free] = _by_tangential(final, TANGENTIAL_SIGMA)
+        covariance *= 1.0 + _SHARED**2 * final.problem.pairs
     by_doubt = np.hstack([by_prior, by_tangential])
-    covariance = shared * of_noise * np.outer(wider, wider) + by_doubt @ by_doubt.T
+    variance = float(final.problem.weight.mean()) / bent(final.weights)
     return replace(
-        final, covariance=covariance, by_doubt=by_doubt, halves_apart=apart, regions=of_regions
+        final,
+        covariance=covariance + by_doubt @ by_doubt.T,
+        by_doubt=by_doubt,
+        halves_apart=Groups.of_time(final).halves_apart(variance),
+        regions=regions,
     )
 
 
@@ -252,29 +338,8 @@ def _by_prior(final: Fit) -> Array:
     shape = prior / np.outer(units, units) + np.diag(np.where(known, 0.0, 1.0))
     root = scale[:, None] * np.linalg.cholesky(shape)
     moves = np.zeros((GLOBAL, GLOBAL))
-    moves[final.block] = inverse(_curvature(final) + prior) @ root
+    moves[final.block] = inverse(_hessian(final)) @ root
     return moves
-
-
-def _curvature(final: Fit) -> Array:
-    """Hessian (k, k) of the free parameters by the matches, with the curvature of the loss."""
-    return np.asarray(bent(final.weights) * final.information)
-
-
-def shaped(final: Fit, covariance: Array) -> Array:
-    """The variances of `covariance` (GLOBAL, GLOBAL) with the correlations of the Hessian."""
-    block = final.block
-    formal = np.asarray(inverse(_curvature(final) + final.problem.prior[block]))
-    wider = np.sqrt(np.diag(covariance[block]) / np.diag(formal))
-    shape = np.zeros_like(covariance)
-    shape[block] = formal * np.outer(wider, wider)
-    return shape
-
-
-def _of_noise(final: Fit) -> Array:
-    """Variances (GLOBAL,) without the errors of the priors."""
-    by_prior = _by_prior(final)
-    return np.asarray(np.diag(final.covariance) - (by_prior**2).sum(axis=1))
 
 
 # Share of a doubt for which derivatives are differences. [chosen: residuals change by less than
@@ -302,40 +367,6 @@ def _by_tangential(final: Fit, sigma: float) -> Array:
     return np.asarray(np.linalg.solve(H, gradients))
 
 
-def _between_regions(final: Fit, of_noise: Array) -> Array:
-    """Factors (GLOBAL,) of the variances by the scatter of regions beyond that of cells.
-
-    `of_noise` (GLOBAL, GLOBAL) is the covariance without the errors of the priors. Cells are
-    regions of the image times stretches of time: if the regions scatter no more than these, the
-    scatter of the stretches is complete.
-    """
-    problem, unknowns, free = final.problem, final.unknowns, final.free
-    region, stretch = _regions(problem.points[0]), stretches(problem.middles)
-    sums = sums_of(problem, unknowns, free)
-    whole, curve = evaluation(problem, unknowns, sums), bent(final.weights)
-    scores, curvatures, cells = [], [], []
-    for name in np.unique(region):
-        of_region = sums_of(problem.matches(region == name), unknowns, free)
-        others = sums._replace(
-            gradient=sums.gradient - of_region.gradient,
-            hessian=sums.hessian - of_region.hessian,
-        )
-        rest = evaluation(problem, unknowns, others)
-        own = whole.score - rest.score
-        scores.append(own.sum(axis=0))
-        curvatures.append(curve * (whole.reduced - rest.reduced).sum(axis=0))
-        cells += [own[stretch == k].sum(axis=0) for k in np.unique(stretch)]
-    H = curve * whole.reduced.sum(axis=0) + problem.prior[final.block]
-    adjusted = adjusted_scores(np.array(scores), np.array(curvatures), H, JACKKNIFE)
-    of_regions = adjusted.T @ adjusted * of_few_groups(len(adjusted))
-    of_cells = np.transpose(cells) @ np.array(cells)
-    covariance = inverse(H)
-    beyond = np.diag(covariance @ (of_regions - of_cells) @ covariance)
-    factors = np.ones(GLOBAL)
-    factors[free] += np.maximum(beyond, 0.0) / np.diag(of_noise)[free]
-    return factors
-
-
 def _regions(points: Array) -> NDArray[np.int64]:
     """Region (N,) of the image of each point (N, 2): columns and rows of equally many points."""
 
@@ -344,39 +375,6 @@ def _regions(points: Array) -> NDArray[np.int64]:
         return np.searchsorted(borders, values)
 
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
-
-
-def _disagreement(final: Fit, of_noise: Array) -> tuple[Array, float]:
-    """Factors (GLOBAL,) of the variances by the difference of both halves; 1 if it is chance.
-
-    Also its mean square over the parameters, in sigmas.
-
-    `of_noise` (GLOBAL, GLOBAL) is the covariance without the errors of the priors, which both
-    halves share.
-    """
-    middles, free = final.problem.middles, final.free
-    first = middles < np.median(middles)
-    one, other = (
-        fit(
-            final.problem.pairs_of(part),
-            final.unknowns.pairs_of(part),
-            free,
-            rounds=_HALF_ROUNDS,
-        )
-        for part in (first, ~first)
-    )
-    difference = one.unknowns.parameters - other.unknowns.parameters
-    turn = one.unknowns.R_cam_imu @ other.unknowns.R_cam_imu.T
-    difference[ROTATION] = log_so3(np.ascontiguousarray(turn))
-    # The whole lets expect four times its own; less than half of that is chance, of few stretches.
-    expected = _of_noise(one) + _of_noise(other)
-    variances = np.maximum(expected, 2.0 * np.diag(of_noise))
-    squares = difference[free] ** 2 / variances[free]
-    mean = float(np.minimum(squares, _GROSS).mean())
-    of_all = mean if mean > _CHANCE else 1.0
-    factors = np.ones(GLOBAL)
-    factors[free] = np.maximum(of_all, np.where(squares > _GROSS, squares, 1.0))
-    return factors, mean
 
 
 # -- Use of a calibration -------------------------------------------------------------------------

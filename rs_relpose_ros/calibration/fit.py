@@ -442,7 +442,7 @@ class Fit:
     by_doubt: Array
     # Mean squared difference, in sigmas, of the parameters of two halves; 0 before it is known.
     halves_apart: float = 0.0
-    # (GLOBAL,) factors of the variances by regions of the image; empty before they are known.
+    # (GLOBAL,) variances by regions of the image over the others; empty before they are known.
     regions: Array = field(default_factory=lambda: np.zeros(0))
 
     @property

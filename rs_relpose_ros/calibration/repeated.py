@@ -34,8 +34,8 @@ class _Own(NamedTuple):
 
     values: Array  # (N, GLOBAL)
     scatters: Array  # (N, GLOBAL, GLOBAL) covariance of each without the doubts
-    # (N, GLOBAL, GLOBAL) the same by the Hessian, scaled: the scatter of few stretches of time has
-    # fewer dimensions than there are parameters, and no inverse.
+    # (N, GLOBAL, GLOBAL) the same by the Hessian with the prior, scaled: without the doubts, what
+    # only the prior determines has no variance, and no inverse.
     shapes: Array
     by_doubt: Array  # (N, GLOBAL, m)
     free: Flags  # (N, GLOBAL) parameters that were fitted
