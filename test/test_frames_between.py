@@ -244,6 +244,34 @@ def test_covariance_is_that_of_the_errors():
     assert 0.2 < np.mean(by_gyro) < 1.2
 
 
+class Late(Scene):
+    """Images are exposed at other times than stamped; the truth is that of the exposures."""
+
+    def __init__(self, seed, sigma):
+        self.delays = np.random.default_rng(seed).exponential(sigma, len(TIMES))
+        super().__init__(seed)
+        first, last = TIMES[[0, -1]] + self.delays[[0, -1]]
+        R, p = self.motion.R(np.array([first, last])), self.motion.p(np.array([first, last]))
+        t = R[0].T @ (p[1] - p[0])
+        self.R, self.t = R[0].T @ R[1], t / np.linalg.norm(t)
+
+    def observe(self, points, s):
+        return super().observe(points, s + self.delays[int(np.argmin(np.abs(TIMES - s)))])
+
+
+def test_covariance_contains_errors_of_the_stamps_of_each_frame():
+    sigma, chi2 = 0.006, {0.0: [], 0.006: []}
+    for seed in range(200, 225):
+        scene = Late(seed, sigma)
+        for stated, found in chi2.items():
+            pose = scene.pose(config=EstimatorConfig(stamp_sigma=stated))
+            if pose and pose.diagnostics.frames == len(TIMES):
+                error = scene.error(pose)[0]
+                found.append(error @ np.linalg.pinv(pose.covariance, rcond=1e-9) @ error / 5.0)
+    assert len(chi2[sigma]) > 15
+    assert np.mean(chi2[sigma]) < 1.4 and np.mean(chi2[0.0]) > 5.0
+
+
 def cost_of(state, arguments, sigma):
     tracks, priors, *_ = arguments
     normal = adjustment.linearised(tracks, priors, state, sigma)

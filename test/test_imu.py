@@ -929,3 +929,41 @@ def test_scale_of_the_accelerometer_drops_out_of_gravity(walk):
     )
     difference = np.linalg.norm(scaled.beta - right.beta) / right.duration
     assert difference < 0.16  # 0.29 m/s^2 of gravity alone otherwise
+
+
+# -- Noise that the samples show ------------------------------------------------------------------
+
+
+def noisy(added, count=400):
+    t = 0.005 * np.arange(count)
+    rates = wobble(count) + added(t)
+    buffer = filled(samples(at_200_hz(count), rates))
+    return buffer.gyro_noise_density(int(at_200_hz(count)[-1]))
+
+
+@pytest.mark.parametrize('ratio', [0.5, 1.0, 1.5])
+def test_a_noise_up_to_the_configured_one_leaves_that(ratio):
+    sigma = ratio * ImuConfig().gyro_noise_density * np.sqrt(200.0)
+    rng = np.random.default_rng(8)
+    assert noisy(lambda t: rng.normal(0.0, sigma, (len(t), 3))) == ImuConfig().gyro_noise_density
+
+
+@pytest.mark.parametrize('axis', [0, 2, slice(None)])
+@pytest.mark.parametrize('ratio', [5.0, 25.0])
+def test_a_larger_noise_of_any_axis_is_the_density_of_a_slice(ratio, axis):
+    density = ratio * ImuConfig().gyro_noise_density
+    rng = np.random.default_rng(9)
+    added = np.zeros((400, 3))
+    added[:, axis] = rng.normal(0.0, density * np.sqrt(200.0), added[:, axis].shape)
+    assert noisy(lambda t: added) == pytest.approx(density, rel=0.25)
+    items = samples(at_200_hz(400), wobble(400) + added)
+    start, end = (int(at_200_hz(400)[k]) for k in (380, 398))
+    frame = frame_imu(filled(items), (end, end), end, np.eye(3), start)
+    assert frame.since_previous.noise_density == pytest.approx(density, rel=0.25)
+
+
+def test_a_tone_counts_by_what_it_leaves_of_the_integral():
+    """A tone of 83 Hz and 0.25 rad/s: its integral is half a milliradian."""
+    density = noisy(lambda t: 0.25 * np.sin(2.0 * np.pi * 83.0 * t)[:, None] * [1.0, 0.6, 0.3])
+    over_a_readout = density * np.sqrt(0.03)
+    assert 2e-4 < over_a_readout < 1e-3

@@ -102,6 +102,7 @@ CONFIGURED = Configured(
     np.zeros(3),
     assessment.configured_sigmas(PARAMETERS, 0.0, CAMERA),
     NONE,
+    PARAMETERS.imu.gyro_noise_density,
 )
 
 
@@ -1185,7 +1186,7 @@ def test_tracked_values_are_those_of_the_parameters(direction, sign):
     camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
     active = deviation(readout_time=sign * 0.002)
     configured = Configured(
-        sensor(readout_direction=direction), camera, np.full(3, 0.1), SIGMA, active
+        sensor(readout_direction=direction), camera, np.full(3, 0.1), SIGMA, active, 2e-4
     )
     c = deviation(time_offset=0.004, readout_time=sign * 0.006)
     c[BIAS] = 0.01, 0.02, 0.03

@@ -30,13 +30,13 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.covariance import ImageInformation, IMAGES
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
+from rs_relpose_ros.imu.noise import noise_of_samples
 from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.doubts import Doubts
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
 from rs_relpose_ros.odometry.interruptions import SampleOrder
-from rs_relpose_ros.odometry.noise import noise_of_samples
 from rs_relpose_ros.odometry.offline import (
     consistency,
     draw_paths,

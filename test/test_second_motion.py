@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
+from scipy.stats import t as student_t
 from test_monitor import flight, NONE
 
 from rs_relpose_ros.calibration import assessment
@@ -106,6 +108,34 @@ def test_rotations_that_differ_as_the_configuration_allows_are_no_contradiction(
     for _ in range(8):
         contradictions.add(pose)
     assert contradictions.too_many
+
+
+@pytest.mark.parametrize(
+    ('squares', 'untested'),
+    [([40.0], True), ([1.0] * 7 + [40.0], True), ([1.0] * 8 + [40.0], False), ([2.0], False)],
+)
+def test_a_pair_that_differs_before_others_agree_is_untested(squares, untested):
+    contradictions = Contradictions()
+    for square in squares:
+        contradictions.add(pose_of(np.ones(30, dtype=bool), square))
+    assert contradictions.is_untested is untested
+    contradictions.add(pose_of(np.ones(30, dtype=bool), 40.0), is_allowed=True)
+    assert not contradictions.is_untested
+    contradictions.clear()
+    contradictions.add(pose_of(np.ones(30, dtype=bool), 40.0))
+    assert contradictions.is_untested
+
+
+def test_covariances_are_those_of_few_tests_at_first():
+    """The distance that contains 99.7 % of them has the same probability with Student's law."""
+    contradictions = Contradictions()
+    pose = replace(pose_of(np.ones(30, dtype=bool), 0.2), covariance=np.eye(6))
+    for number in range(31):
+        factor = contradictions.widened(pose).covariance[0, 0]
+        tested = student_t(20 + 3 * number)
+        assert tested.sf(norm.isf(0.0015) * np.sqrt(factor)) == pytest.approx(0.0015, rel=0.15)
+        contradictions.add(pose)
+    assert factor < 1.05
 
 
 def test_a_scene_behind_an_object_that_agrees_with_the_gyro_keeps_its_poses():

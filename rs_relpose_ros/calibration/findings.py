@@ -320,6 +320,7 @@ class Configured:
     gyro_bias: Array  # (3,) parameter [rad/s]
     sigmas: Array  # (K,) configured, of the deviations; 0 if not known
     active: Array  # (K,) deviations applied already: tracked parameters, bias at rest
+    gyro_noise_density: float  # parameter [rad/s/sqrt(Hz)]
 
     @property
     def direction(self) -> float:

@@ -402,7 +402,7 @@ def _noise_of_imu(finding: Finding) -> Text:
     (parameter, value) = next(iter(finding.settings.items()))
     assert finding.estimate is not None and finding.active is not None
     return Text(
-        f'pairs show {finding.estimate:.2g} +- {finding.sigma:.1g} {finding.unit}, configured '
+        f'it is {finding.estimate:.2g} +- {finding.sigma:.1g} {finding.unit}, configured '
         f'{finding.active:.2g}: vibration, held samples, or a wrong scale; used as it shows',
         f'set {parameter}: {value:g} if it is always so, or mount the IMU softly',
     )

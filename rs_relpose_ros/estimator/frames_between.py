@@ -65,6 +65,14 @@ _MOST_TRACKS = 5 * BLOCK
 # other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
 # of the frames, so that the covariance would be too small. [derived: 4 sigmas in 2 thresholds]
 _LARGEST_NOISE = 0.5
+# Scatter of the stamps [s] from which each frame's own error is in the covariance. Less would cost
+# time for shifts that are smaller than the noise, more would make the covariance of a camera that
+# is stamped on arrival too small. [chosen: 0.2 to 1 ms would do: a camera that turns by 1 rad/s
+# moves by a quarter of a pixel in half a millisecond]
+_JITTER = 5e-4
+# Least time between the first and the last sample of a frame [s], by which its rate changes. It
+# keeps the change of a global shutter finite. [chosen: below any readout; 1e-4 to 1e-3 would do]
+_LEAST_SPAN = 1e-3
 # Of the residuals of two views, at least this part of the configured noise starts the adjustment:
 # exact matches would make the first weights infinite. [chosen: any value in 0.01..0.3 would do]
 _LEAST_NOISE = 0.1
@@ -101,6 +109,9 @@ def refined(
             f'other: {adjusted.sigma:.1f} px',
         )
     pose = _result(pose, adjusted, path, tracks, priors)
+    if path.rate_doubt or config.stamp_sigma > _JITTER:
+        of_frames = _covariance_of_frames(adjusted, path, tracks, observed)
+        pose = replace(pose, covariance=pose.covariance + of_frames)
     changes = _changes(path, observed)
     if changes is None:
         return pose
@@ -479,6 +490,49 @@ def _changes(path: PairProblem, observed: _Observed) -> Changes | None:
         between.by_deviation,
         np.stack([states.rotation for states in frames]),
         observed.by_lens,
+    )
+
+
+# Errors of a frame's own: of its rate (three axes), and of its stamp.
+_OF_FRAME = 4
+
+
+def _covariance_of_frames(
+    adjusted: Adjusted, path: PairProblem, tracks: TrackBlocks, observed: _Observed
+) -> Array:
+    """Covariance (6, 6) of the pose by the errors of rate and stamp of each frame for itself."""
+    changes = _changes_by_frames(path, observed)
+    moved = adjustment.path_by_deviations(tracks, adjusted.state, adjusted.normal, changes)
+    by_frame = _pose_by_path(adjusted, tracks) @ moved
+    of_rate, of_stamp = path.rate_doubt**2, path.config.stamp_sigma**2
+    variances = np.tile([of_rate, of_rate, of_rate, of_stamp], len(path.motions))
+    return np.asarray(by_frame * variances @ by_frame.T)
+
+
+def _changes_by_frames(path: PairProblem, observed: _Observed) -> Changes:
+    """Changes of turns and times by the errors that each of V frames has for itself, 4 V in all.
+
+    An error of the rate turns the rows against the stamped one. An error of the stamp moves all
+    rows in time, and turns them as far as the rate changes; its effect on the rotations between
+    frames is part of their prior.
+    """
+    views, count = observed.times.shape
+    turns = np.zeros((views, count, 3, _OF_FRAME * views))
+    times = np.zeros((views, count, _OF_FRAME * views))
+    for view, motion in enumerate(path.motions):
+        rows = _path_of_rows(motion)
+        lasted = max(float(rows.times[-1] - rows.times[0]), _LEAST_SPAN)
+        change = (rows.rates[-1] - rows.rates[0]) / lasted
+        own = _OF_FRAME * view
+        rates = np.column_stack([np.eye(3), change])
+        turns[view, :, :, own : own + _OF_FRAME] = observed.times[view, :, None, None] * rates
+        times[view, :, own + _OF_FRAME - 1] = 1.0
+    return Changes(
+        turns,
+        times,
+        np.zeros((views, 3, _OF_FRAME * views)),
+        np.zeros((views, count, 3, 3)),
+        np.zeros((views, count, 3, 0)),  # no deviation of the lens
     )
 
 

@@ -40,6 +40,9 @@ class PairProblem:
     # gyro from the first frame to the last one, relative to the first reference row at time 0.
     gyro: GyroPath | None = None
     R_cam_imu: Array | None = None
+    # [rad/s] 1 sigma per axis of each frame's own error of its rate, beyond that of `config`: a
+    # gyro that is noisier than configured.
+    rate_doubt: float = 0.0
 
     @property
     def interval(self) -> float | None:

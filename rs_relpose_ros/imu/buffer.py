@@ -21,6 +21,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, Stamps, to_nanoseconds
 from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
+from rs_relpose_ros.imu.noise import shown_density
 
 # A step between samples of more than this many times the usual one: a sample may still arrive.
 # [derived: halfway between one step and two]
@@ -28,6 +29,9 @@ _LATE_STEP = 1.5
 # Duration of the samples [ns] by which the accelerometer is tested. Within a shorter one the mean
 # force contains the acceleration of a step. [derived: a walk has two steps a second]
 _TESTED_NS = 1_000_000_000
+# Duration of the samples [ns] by which the noise of the gyro is measured. A shorter one scatters
+# more, a longer one follows a motor that starts later. [chosen: 0.5 to 2 s would do]
+_NOISE_NS = 1_000_000_000
 # Samples for which a series has room at first, and by which it grows. [chosen: a second]
 _ROOM = 256
 # Old samples are removed when the oldest has this part of the buffer's length more than it: a
@@ -353,6 +357,8 @@ class ImuBuffer(ImuSamples):
         self.config = config
         self._configured_bias = np.array(config.gyro_bias)
         self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
+        # Half of the buffer is there, whenever it is asked for.
+        self._noise_ns = min(_NOISE_NS, self._keep_ns // 2)
         super().__init__(config.max_imu_gap)
 
     def clear(self) -> None:
@@ -412,6 +418,14 @@ class ImuBuffer(ImuSamples):
             duration_ns = self._keep_ns // 2
         first = int(self.force.stamps.searchsorted(until_ns - duration_ns))
         return self.force.values[first : self.force.number_until(until_ns)]
+
+    def gyro_noise_density(self, until_ns: int) -> float:
+        """Density of the gyro's noise by the samples up to a time, at least as configured."""
+        first = int(self.gyro.stamps.searchsorted(until_ns - self._noise_ns))
+        last = self.gyro.number_until(until_ns)
+        seconds = (self.gyro.stamps[first:last] - until_ns) / NANOSECONDS
+        rates = self.gyro.values[first:last]
+        return shown_density(rates, seconds, self.config.gyro_noise_density)
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at a time, from samples up to it; to be called in the order of time."""
@@ -565,7 +579,7 @@ def _slice(
         rates @ R_cam_imu.T,
         R_cam_imu @ bias.value,
         bias.sigma,
-        buffer.config.gyro_noise_density,
+        buffer.gyro_noise_density(between_ns[1]),
         no_force,
     )
 

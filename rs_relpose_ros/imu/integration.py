@@ -15,6 +15,7 @@ from rs_relpose_ros.geometry.gyro import GyroPath, integrated_rotations
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.geometry.timing import seconds_between, Stamps
+from rs_relpose_ros.imu.noise import shown_density
 from rs_relpose_ros.jit import kernel
 
 
@@ -339,11 +340,25 @@ def inertial_motion(
     spread = across_variance * (np.eye(3) - along) + second.at_rest_sigma**2 * along
     position = np.array(config.imu_position)
     motion = preintegrate(
-        seconds, rates, forces, gravity, spread, position, config, since.bias_sigma
+        *(seconds, rates, forces, gravity, spread, position),
+        _with_noise_of(since, config),
+        since.bias_sigma,
     )
     return validate.replaced(
         motion, acceleration1=first.force + gravity, acceleration2=R @ second.force + gravity
     )
+
+
+def _with_noise_of(since: ImuSlice, config: ImuConfig) -> ImuConfig:
+    """The configuration with the noise that the samples show."""
+    seconds = np.asarray(since.force_stamps_ns * 1e-9, dtype=np.float64)
+    densities = {
+        'gyro_noise_density': since.noise_density,
+        'accel_noise_density': shown_density(since.forces, seconds, config.accel_noise_density),
+    }
+    if all(getattr(config, name) == density for name, density in densities.items()):
+        return config
+    return validate.replaced(config, **densities)
 
 
 def motions_on_the_way(

@@ -11,6 +11,7 @@ from rs_relpose_ros.calibration.findings import Code, Evidence, Finding, Finding
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.imu.buffer import ImuInterval
+from rs_relpose_ros.imu.noise import FEWEST_SAMPLES, noise_of_samples
 
 # Densities [m/s^2/sqrt(Hz)] of errors of an accelerometer that its noise does not have (scale,
 # axes, vibration, clock), from which innovations choose. A shorter list could not follow a bad
@@ -49,13 +50,6 @@ _NAMED_CHANCE = 1e-2
 # Innovations before which no noise is named: the prior decides until then.
 # [chosen: 10 to 50 would do: some seconds]
 _LEAST_NAMED = 20
-# Variance of the third difference of white noise of unit variance. [derived: 1 + 9 + 9 + 1]
-_THIRD_DIFFERENCE = 20.0
-# Median of the size of a normal variable by its sigma. [derived: of the normal distribution]
-_MEDIAN = 0.6745
-# Fewest samples whose third differences show a noise. Fewer would be too uncertain, more would
-# miss it in short intervals. [chosen: 8 to 20 would do: three axes of each]
-_LEAST_SAMPLES = 10
 # Change of the specific force between two samples [m/s^2] from which its mean is not known: a
 # knock, whose peak lies between the samples. Steps of a walk change it by less at 50 Hz or more; a
 # smaller bound would take them for knocks, a larger one would trust a knock.
@@ -108,17 +102,6 @@ def _prior(accel_sigma: float, gyro_half: float) -> Array:
     return np.asarray(accel[:, None, None] + gyro[:, None] + pair)
 
 
-def noise_of_samples(values: Array, seconds: Array) -> float:
-    """Density of the white noise of samples (K, 3), or of a vibration, by their third differences.
-
-    A motion hardly changes these at the rate of an IMU. A vibration is no white noise: its
-    integral may be smaller.
-    """
-    size = np.median(np.abs(np.diff(values, n=3, axis=0)))
-    sigma = float(size) / (_MEDIAN * math.sqrt(_THIRD_DIFFERENCE))
-    return sigma * math.sqrt(float(np.median(np.diff(seconds))))
-
-
 class NoisePosterior:
     """Noise of accelerometer, gyro and pairs, by a posterior over a grid.
 
@@ -138,7 +121,7 @@ class NoisePosterior:
         Without it, states of the first seconds with a vibrating IMU would be too certain.
         """
         seconds = interval.seconds
-        if len(seconds) < _LEAST_SAMPLES:
+        if len(seconds) < FEWEST_SAMPLES:
             return
         accel = _beyond(noise_of_samples(interval.forces, seconds), imu.accel_noise_density)
         gyro = _beyond(noise_of_samples(interval.rates, seconds), imu.gyro_noise_density)

@@ -330,6 +330,7 @@ class RotationWatch(Processor[None]):
                 np.array(parameters.imu.gyro_bias),
                 np.zeros(LIVE.size),
                 np.zeros(LIVE.size),
+                parameters.imu.gyro_noise_density,
             ),
         )
         self._monitor.assess()

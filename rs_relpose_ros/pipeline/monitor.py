@@ -60,6 +60,17 @@ _MOST_REJECTED = 2
 # The same of pairs whose rotation differs from the gyro's by `CONTRADICTS_GYRO`. [measured: none
 # on correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
 _MOST_DIFFERENT = 5
+# Pairs that agree with the gyro, before which a pair that differs from it has no pose: no test has
+# excluded yet that all of them will. Fewer would publish the first pairs of a camera that is
+# configured wrong, more would withhold single poor pairs of correct recordings for longer.
+# [measured: on portrait, squeezed and stabilised images the first four pairs have a chi-square of
+# 13 to 530 and are up to 6 of their sigmas off; on correct walks it is at most 1.3]
+_TESTED = 8
+# Part of the distance of 99.7 % by which it grows with the inverse of the degrees of freedom that
+# a variance is known by. [derived: Student's distribution, (z^2 + 1) / 4 at z = 2.97]
+_STUDENT = 2.46
+# Degrees of freedom of a pair's rotation against the gyro's. [derived: a rotation has three]
+_OF_ROTATION = 3.0
 # Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
 # a moving object would widen the pairs of many seconds.
 # [chosen: far above the 99.9 % quantile of two degrees of freedom, 6.9]
@@ -98,6 +109,7 @@ class ConsistencyMonitor:
         self.stamp_sigma = 0.0  # [s] scatter of the stamps of the last frames
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
+        self._noise: Finding | None = None  # of the gyro, by its samples of the last pair
         self.clock_steps = ClockSteps()
         self.second_motions = SecondMotions()
         self.contradictions = Contradictions()
@@ -140,6 +152,7 @@ class ConsistencyMonitor:
         self.latest, self._due = None, _Due(stamp_ns, data, pose, configured)
         if data is None:
             return pose
+        self._noise = assessment.noise_of_gyro(data, configured)
         by_deviation = pose.by_deviation
         if by_deviation is None or self._undetermined is None:
             # Two views, or the first pair: the covariance needs what the pair itself tells.
@@ -232,22 +245,28 @@ class ConsistencyMonitor:
             unknown = assessment.contradicting(*self.contradictions.counts)
             others = assessment.not_evaluated(set(), unknown.code)
             self.health = Assessment((unknown, *others))
+        if self._noise is not None and self._noise.state is FindingState.WRONG:
+            # Rows that the gyro turns wrongly say nothing of the other quantities.
+            others = assessment.not_evaluated(set(), self._noise.code)
+            self.health = Assessment((self._noise, *others))
         self._wrong_configuration = bool(self.health.faults)
         # Nor are velocities of rotations that contradict the gyro.
         if self._wrong_configuration or self.contradictions.counts[0] > _MOST_REJECTED:
             self.acceleration.clear()
-        also = self.acceleration.finding()
-        also_found = () if also is None else (also,)
-        found = (*self.health.findings, *also_found)
-        found = (*found, *self._of_changes(due.stamp_ns))
+        self._add_others(due.stamp_ns)
+
+    def _add_others(self, stamp_ns: int) -> None:
+        """Add the findings that do not depend on the parameters."""
+        found = self.health.findings
+        if (also := self.acceleration.finding()) is not None:
+            found = (*found, also)
+        found = (*found, *self._of_changes(stamp_ns))
+        if self._noise is not None and self._noise not in found:
+            found = (*found, self._noise)
         # A gyro of another unit moves images elsewhere: parts seem still by chance.
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)
         self.health = Assessment(found)
-        self.residuals.test_in_turn()
-        # Residuals differ as rotations do where a parameter deviates within its stated sigma.
-        if not self.deviates_as_allowed(configured):
-            self.health = self.residuals.added_to(self.health)
 
     def _find_inconsistencies(self, configured: Configured) -> None:
         """Find which quantities are off, or change, by all pairs so far."""
@@ -448,6 +467,8 @@ class Contradictions:
 
     def __init__(self) -> None:
         self._kinds: deque[tuple[bool, bool]] = deque(maxlen=_RECENT)
+        self._agreed = 0
+        self.is_untested = False  # whether the last pair differs, and few have agreed before it
 
     def add(self, pose: RelativePose, *, is_allowed: bool = False) -> None:
         """Add a pair with the pose of its estimate, which may be rejected.
@@ -457,10 +478,23 @@ class Contradictions:
         is_rejected = pose.diagnostics.rejected is not None
         differs = not is_allowed and pose.diagnostics.gyro_square > CONTRADICTS_GYRO
         self._kinds.append((is_rejected, is_rejected or differs))
+        self.is_untested = differs and self._agreed < _TESTED
+        self._agreed += not (is_rejected or differs)
 
     def clear(self) -> None:
         """Forget the pairs."""
         self._kinds.clear()
+        self._agreed = 0
+
+    def widened(self, pose: RelativePose) -> RelativePose:
+        """The pose with the covariance of a noise that the pairs so far have tested.
+
+        Few tests leave room for a larger one: the distance that contains 99.7 % is that of
+        Student's distribution, with the prior of `Agreement` and three degrees of freedom a pair.
+        """
+        tested = 2.0 * _PRIOR_PAIRS + _OF_ROTATION * self._agreed
+        factor = (1.0 + _STUDENT / tested) ** 2
+        return replace(pose, covariance=factor * pose.covariance)
 
     @property
     def counts(self) -> tuple[int, int]:

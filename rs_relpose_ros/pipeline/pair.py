@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.calibration.residual_maps import PairSums
-from rs_relpose_ros.config.settings import KeyframeConfig, Parameters
+from rs_relpose_ros.config.settings import ImuConfig, KeyframeConfig, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.pair_problem import PairProblem
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry import Array, validate
-from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
@@ -432,6 +432,7 @@ class TrackHistory:
         on_sensor = sensor.intrinsics.to_sensor(np.concatenate(points))
         seed = parameters.pair.seed, self.stamp_ns, stamp_ns
         configured = parameters.estimator
+        rate_doubt = _rate_doubt(slices[-1], parameters.imu, sensor.camera)
         return PairProblem(
             replace(matches, points=on_sensor.reshape(len(imus), -1, 2)),
             sensor.camera,
@@ -449,11 +450,13 @@ class TrackHistory:
                 configured,
                 gravity_sigma=gravity_sigma,
                 stamp_sigma=max(configured.stamp_sigma, stamp_sigma),
+                gyro_sigma=math.hypot(configured.gyro_sigma, rate_doubt),
             ),
             int(np.random.default_rng(seed).integers(2**63)),
             reason,
             None if slices[-1] is None else slices[-1].path,
             parameters.sensor.R_cam_imu,
+            rate_doubt,
         )
 
     def _accelerations(
@@ -566,6 +569,19 @@ def inertial_of(
         second,
         parameters.imu,
     )
+
+
+def _rate_doubt(since: ImuSlice | None, imu: ImuConfig, camera: RollingShutterCamera) -> float:
+    """1 sigma [rad/s] of the mean rate of a frame by the noise beyond the configured one.
+
+    The random walk of the readout has a slope of 6 / 5 of the noise by the time. The rotations
+    between frames contain half of it already: they begin with the same samples.
+    """
+    if since is None or since.noise_density <= imu.gyro_noise_density:
+        return 0.0
+    begin, end = camera.row_time_span
+    more = since.noise_density**2 - imu.gyro_noise_density**2
+    return math.sqrt(0.6 * more / (end - begin)) if end > begin else 0.0
 
 
 def _with_gravity(

@@ -65,6 +65,11 @@ _UNMATCHED_PERIOD = 0.5
 _STEP_SOUGHT = f'{GYRO_CONTRADICTION}, other than before: a step of a clock is looked for'
 # Reason for a pair among others that contradict the gyro. [derived: text for people]
 _CONTRADICTING = 'the images of most of the last pairs contradict the gyro, whatever the cause'
+# Reason for a pair that contradicts the gyro before others agree. [derived: text for people]
+_UNTESTED = (
+    'the images contradict the gyro, and few pairs before agree with it: the configuration is '
+    'being tested'
+)
 # Reason for a pair that may follow an object. [derived: text for people]
 _TWO_MOTIONS = (
     'the matches have two motions, and the images contradict the gyro: an object moves in the view'
@@ -378,6 +383,7 @@ class Pipeline(Processor[PairResult]):
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
             pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
+            pose = monitor.contradictions.widened(pose)
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         sums_of = _residual_sums(frame, rays, pose, sensor)
         self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured, sums_of))
@@ -385,6 +391,8 @@ class Pipeline(Processor[PairResult]):
             pose = suppressed(pose, monitor.health)
             if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
+            if monitor.contradictions.is_untested:
+                pose = withheld(pose, _UNTESTED)
             if monitor.contradictions.too_many:
                 pose = withheld(pose, _CONTRADICTING)
             if follows_object:
@@ -463,6 +471,7 @@ class Pipeline(Processor[PairResult]):
             bias,
             configured_sigmas(parameters, from_reference, sensor.camera, offset_sigma),
             np.zeros(LIVE.size),
+            parameters.imu.gyro_noise_density,
         )
         configured.active[LIVE.index('time_offset')] = applied_offset_ns / NANOSECONDS
         configured.active[LIVE.index('readout_time')] = configured.direction * self._readout
@@ -524,7 +533,7 @@ def _measurement(
         fitted.t,
         since,
         parameters.sensor.R_cam_imu,
-        parameters.estimator.gyro_sigma,
+        problem.config.gyro_sigma,
     )
 
 
