@@ -254,6 +254,10 @@ class ConsistencyMonitor:
         if self._wrong_configuration or self.contradictions.counts[0] > _MOST_REJECTED:
             self.acceleration.clear()
         self._add_others(due.stamp_ns)
+        self.residuals.test_in_turn()
+        # Residuals differ as rotations do where a parameter deviates within its stated sigma.
+        if not self.deviates_as_allowed(configured):
+            self.health = self.residuals.added_to(self.health)
 
     def _add_others(self, stamp_ns: int) -> None:
         """Add the findings that do not depend on the parameters."""
