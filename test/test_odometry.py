@@ -10,6 +10,7 @@ import pickle
 from types import FunctionType, ModuleType
 
 import gtsam
+from gtsam.symbol_shorthand import X
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -1126,6 +1127,19 @@ def test_no_images_for_longer_than_the_window(walked, tracked):
                 keyframe.velocity_covariance[:3, :3] + undisturbed.velocity_covariance[:3, :3]
             )
         )
+
+
+def test_a_long_bridge_begins_another_window(walked):
+    """Its keyframes would be linearised where the bridge ended, decimetres from where it was."""
+    gaps = {3.5: 3.6, 6.0: 7.5}  # one within a quarter of the window of 2 s, one beyond
+    kept = []
+    for begin, end in gaps.items():
+        pairs = without(walked.pairs, begin, end)
+        until = [pair for pair in pairs if seconds_of(pair.reference_imu_ns) < end + 0.2]
+        graph = run(walked, pairs=until)[0]._run.graph
+        kept.append(sum(graph._values.exists(X(k)) for k in range(graph._count)))
+    assert kept[0] > 8  # of 2 s
+    assert kept[1] <= 4  # its end and what followed
 
 
 def test_earlier_losses_stay_in_the_covariance(walked):

@@ -293,10 +293,10 @@ def loop_bound(dimension: int) -> float:
 # -- priors -----------------------------------------------------------------------------------
 
 
-def joint_prior(start: Any, covariance: Array) -> Any:
-    """All unknowns of keyframe 0 and `doubts`, given together; `start`: ``gtsam.Values``."""
-    pose, bias = start.atPose3(X(0)), start.atConstantBias(B(0))
-    velocity, d = start.atVector(V(0)), start.atVector(L(0))
+def joint_prior(k: int, start: Any, covariance: Array) -> Any:
+    """All unknowns of keyframe k and `doubts`, given together; `start`: ``gtsam.Values``."""
+    pose, bias = start.atPose3(X(k)), start.atConstantBias(B(k))
+    velocity, d = start.atVector(V(k)), start.atVector(L(0))
     identity = np.eye(len(covariance))
     ends = np.cumsum([6, 3, 6, len(d)])
     blocks = [np.asfortranarray(one) for one in np.split(identity, ends[:-1], axis=1)]
@@ -309,17 +309,17 @@ def joint_prior(start: Any, covariance: Array) -> Any:
         if jacobians is not None:
             for number, block in enumerate(blocks):
                 jacobians[number] = block
-        now = values.atConstantBias(B(0))
+        now = values.atConstantBias(B(k))
         return np.concatenate(
             [
-                pose.localCoordinates(values.atPose3(X(0))),
-                values.atVector(V(0)) - velocity,
+                pose.localCoordinates(values.atPose3(X(k))),
+                values.atVector(V(k)) - velocity,
                 now.vector() - bias.vector(),
                 values.atVector(L(0)) - d,
             ]
         )
 
-    return gtsam.CustomFactor(gaussian(covariance), [X(0), V(0), B(0), L(0)], error)
+    return gtsam.CustomFactor(gaussian(covariance), [X(k), V(k), B(k), L(0)], error)
 
 
 def gaussian(covariance: Array) -> Any:

@@ -63,9 +63,12 @@ _FIRST_LEAST_VARIANCE = 1.0
 # Innovations that show a small variance. Fewer would make starts too certain, more would delay
 # what they show. [chosen: 20 to 60 would do, some seconds of pairs]
 _SHOWN = 30
-# Largest share of the window that one interval takes. A longer bridge would push the states before
-# it out of the window, and the first pairs after it could not correct them. [chosen: 0.1 to 0.5]
-_LONGEST_STEP = 0.25
+# Longest bridge of the IMU, as a share of the window, after which the states before it stay in the
+# window. After a longer one the first pairs move its end by decimetres: the smoother, which
+# linearises its oldest states where they were at first, would take that for a turn of their ways.
+# A smaller share would forget the window of short gaps.
+# [measured: docs/lab/odometry.md, "Long bridges": 17 % of the states are beyond after 8 s]
+_LONGEST_BRIDGE = 0.25
 # Most steps of the optimisation with a keyframe. With fewer, a start would remain far off where
 # the way of the camera is not known at first; one step does for most keyframes.
 # [measured: with 10 another one changes no path by 0.2 mm, docs/lab/odometry.md]
@@ -194,9 +197,7 @@ class KeyframeGraph:
         # Squared density of the gyro's noise before innovations show more.
         self._gyro_variance = self._imu.gyro_noise_density**2
         self._step = _NO_STEP
-        # Each update is one step of the optimisation, which the next keyframe continues.
-        lag = self._config.smoothing_lag
-        self._smoother = gtsam.BatchFixedLagSmoother(lag, _optimizer(1))
+        self._smoother = self._new_smoother()
         # All factors and states since the start, for the final smoothing.
         self._record = (gtsam.NonlinearFactorGraph(), gtsam.Values()) if keep else None
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -211,7 +212,7 @@ class KeyframeGraph:
             return factors.gaussian(start.covariance[part, part])
 
         if continued:
-            graph.add(factors.joint_prior(values, start.covariance))
+            graph.add(factors.joint_prior(0, values, start.covariance))
         else:
             graph.addPriorPose3(X(0), pose, of(POSE))
             graph.addPriorVector(V(0), start.velocity, of(VELOCITY))
@@ -219,6 +220,7 @@ class KeyframeGraph:
             graph.addPriorVector(L(0), start.doubts, of(DOUBTS))
         self._ahead = values
         self._update(graph, values, 0, 0.0)
+        self._keep(graph)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -297,10 +299,34 @@ class KeyframeGraph:
             at_zero = factors.diagonal([_REST_VELOCITY_SIGMA] * 3)
             for key in (V(i), V(j)):
                 graph.addPriorVector(key, np.zeros(3), at_zero)
-        # States before a long bridge stay: the first pairs after it correct them, too.
-        lasting = min(interval.duration, _LONGEST_STEP * self._config.smoothing_lag)
-        self._update(graph, values, j, self._seconds + lasting)
+        seconds = self._seconds + interval.duration
+        if pair is None and interval.duration > _LONGEST_BRIDGE * self._config.smoothing_lag:
+            self._bridge(interval, values, j, seconds)
+        else:
+            self._update(graph, values, j, seconds)
+        self._keep(graph)
         return innovation
+
+    def _new_smoother(self) -> Any:
+        """An empty window; each update is one step, which the next keyframe continues."""
+        return gtsam.BatchFixedLagSmoother(self._config.smoothing_lag, _optimizer(1))
+
+    def _bridge(self, interval: ImuInterval, values: Any, newest: int, seconds: float) -> None:
+        """Begin another window at the newest keyframe, with all that the IMU leaves of the last.
+
+        `values`: of that keyframe.
+        """
+        state = self.propagated(interval)
+        values.insert(L(0), state.doubts)
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(factors.joint_prior(newest, values, state.covariance))
+        self._smoother, self._ahead = self._new_smoother(), values
+        self._update(graph, values, newest, seconds)
+
+    def _keep(self, graph: Any) -> None:
+        """Record factors for the final smoothing."""
+        if self._record is not None:
+            self._record[0].push_back(graph)
 
     def _hold_still(self, graph: Any, step: _Step, certain: bool) -> None:
         """Hold the camera in its place if this is `certain`, or if the IMU knows that it stays.
@@ -600,8 +626,6 @@ class KeyframeGraph:
                 self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
             self._read(newest)
         self._count, self._seconds = newest + 1, seconds  # keyframes; time of the newest
-        if self._record is not None:
-            self._record[0].push_back(graph)
 
     def _read(self, newest: int) -> None:
         """Read the estimates of the smoother."""
