@@ -23,6 +23,7 @@ from rs_relpose_ros.calibration.findings import (
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.offline.replay import replay_into
+from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking import still
 from rs_relpose_ros.tracking.features import find_corners, make_tracker, within
 from rs_relpose_ros.tracking.still import COLUMNS, ROWS, StillParts
@@ -210,6 +211,38 @@ def test_an_intact_walk_has_neither_finding(recording, tmp_path):
     assert pairs
     codes = {finding.code for finding in health.findings}
     assert codes.isdisjoint({Code.REPEATED_IMAGES, Code.STATIC_REGION})
+
+
+@pytest.mark.parametrize(
+    ('share', 'code', 'candidates'),
+    [
+        (0.2, Code.STATIC_REGION, ()),
+        (0.4, Code.STATIC_REGION, ()),
+        (0.6, Code.INTERIOR, (Code.INTERIOR, Code.STATIC_REGION)),
+        (0.9, Code.INTERIOR, (Code.INTERIOR, Code.STATIC_REGION)),
+    ],
+)
+def test_most_of_the_view_that_does_not_move_is_an_interior(share, code, candidates):
+    """Images do not tell a cabin from a cover of the lens: the cover is a candidate."""
+    view = StillView()
+    view.start(0, np.zeros((HEIGHT, WIDTH), dtype=np.uint8))
+    view.static = np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS) < share * ROWS * COLUMNS
+    (finding,) = view.findings()
+    assert (finding.code, finding.candidates) == (code, candidates)
+    description, fix = findings_text.text_of(finding)
+    assert f'{100 * share:.0f} % of the image' in description
+    assert ('vehicle' in description) == (code is Code.INTERIOR)
+    assert ('by hand' in fix) == (code is Code.INTERIOR)
+
+
+def test_the_interior_takes_the_place_of_its_first_cells_in_a_run():
+    first = Finding(Code.STATIC_REGION, FindingState.SUSPECT, Why.STILL)
+    whole = Finding(Code.INTERIOR, FindingState.SUSPECT, Why.STILL)
+    wrong = Finding(Code.TIME_OFFSET, FindingState.WRONG, Why.OFF)
+    run = worst_of(Assessment((first, wrong)), Assessment((whole,)))
+    assert {one.code for one in run.findings} == {Code.INTERIOR, Code.TIME_OFFSET}
+    # The first of them replaces what the interior spoiled, as any static part does.
+    assert worst_of(Assessment((wrong,)), Assessment((whole,))) == Assessment((whole,))
 
 
 def test_the_first_finding_of_a_static_part_replaces_what_it_spoiled():

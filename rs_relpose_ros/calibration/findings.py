@@ -71,6 +71,7 @@ class Code(str, Enum):
     ACCEL_SCALE = 'accel_scale'
     REPEATED_IMAGES = 'repeated_images'
     STATIC_REGION = 'static_region'
+    INTERIOR = 'interior'
     MOVING_OBJECT = 'moving_object'
     OFFSET_STEP = 'offset_step'
     OFFSET_DRIFT = 'offset_drift'
@@ -196,6 +197,8 @@ class Finding:
         return bool(self.estimated) or self.state is not FindingState.UNKNOWN
 
 
+# Parts of the image that do not move, and are masked: a small one, and most of the view.
+_MASKED = (Code.STATIC_REGION, Code.INTERIOR)
 # Causes that move other parameters before they are found. [derived: pairs across a change of the
 # offset or of the lens, of an object, and those that no parameter explains, are no evidence of
 # another parameter]
@@ -238,7 +241,7 @@ class Assessment:
     @property
     def masks(self) -> bool:
         """Whether a part of the image is masked, which spoiled what was found before."""
-        return any(finding.code is Code.STATIC_REGION for finding in self.findings)
+        return any(finding.code in _MASKED for finding in self.findings)
 
     def is_disturbed_since(self, before: Assessment) -> bool:
         """Whether what was found before may be a trace of a finding that is new since then."""
@@ -270,7 +273,8 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
     If `now` has a gross error, masks a part of the image, or has a change of the offset or pairs
     without an explanation, and `before` had not, earlier findings were its traces and are dropped.
     So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`), and a
-    pattern of residuals once anything else is found, which explains it.
+    pattern of residuals once anything else is found, which explains it. Of what is masked, the
+    later finding has the extent.
     """
     traces = (
         (now.is_gross and not before.is_gross)
@@ -279,7 +283,12 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
     )
     kept = () if traces else before.findings
     is_explained = any(one.why is not Why.RESIDUALS for one in now.faults)
-    found = {one.code: one for one in kept if not (is_explained and one.why is Why.RESIDUALS)}
+    found = {
+        one.code: one
+        for one in kept
+        if not (is_explained and one.why is Why.RESIDUALS)
+        and not (now.masks and one.code in _MASKED)
+    }
     # A quantity that was observable once is not unknown any more.
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:

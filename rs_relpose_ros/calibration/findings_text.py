@@ -301,13 +301,30 @@ def _repeated_images(finding: Finding) -> Text:
 
 
 def _static_region(finding: Finding) -> Text:
-    measured = finding.evidence.measured
-    (left, right), (top, bottom) = measured['columns'], measured['rows']
     return Text(
-        f'{100.0 * measured["share"]:.0f} % of the image do not move with the scene (within '
-        f'columns {left} to {right}, rows {top} to {bottom}): this part is masked',
+        f'{_extent(finding)} do not move with the scene: this part is masked',
         'if it is a caption, a dirty lens, the hood or the interior of a vehicle, nothing has to '
         'be done; poses come from the rest of the image',
+    )
+
+
+def _interior(finding: Finding) -> Text:
+    return Text(
+        f'{_extent(finding)} do not move though the camera turns: most of the view moves with the '
+        'IMU, as inside a vehicle, and is masked; poses are those of the vehicle, from the rest',
+        'let the scene outside fill most of the view: mount the camera at the window, or crop the '
+        'images to it with their CameraInfo. Turn the camera by hand: an interior then moves, '
+        'what covers the lens does not',
+    )
+
+
+def _extent(finding: Finding) -> str:
+    """Share and place of what does not move."""
+    measured = finding.evidence.measured
+    (left, right), (top, bottom) = measured['columns'], measured['rows']
+    return (
+        f'{100.0 * measured["share"]:.0f} % of the image (within columns {left} to {right}, rows '
+        f'{top} to {bottom})'
     )
 
 
@@ -421,6 +438,7 @@ def _knock(finding: Finding) -> Text:
 _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.REPEATED_IMAGES, Why.STILL): _repeated_images,
     (Code.STATIC_REGION, Why.STILL): _static_region,
+    (Code.INTERIOR, Why.STILL): _interior,
     (Code.MOVING_OBJECT, Why.TWO_MOTIONS): _moving_object,
     (Code.OFFSET_STEP, Why.STEPPED): _offset_step,
     (Code.OFFSET_DRIFT, Why.DRIFTING): _offset_drift,

@@ -27,6 +27,11 @@ from rs_relpose_ros.tracking.still import (
 # Number of the last images among which repeated ones are counted. More would report a driver that
 # has stopped repeating. [chosen: 20 s at 30 Hz]
 _COUNTED = 600
+# Share of the image from which a part that does not move is most of the view: the interior of a
+# vehicle, and not what covers a part of the lens. Images alone cannot tell them: neither moves in
+# the camera. A lower share names a wide hood so, a higher one misses a cabin with large windows.
+# [chosen: hoods and captions cover up to a third, windows of a cabin a fifth to two fifths]
+_MOST_OF_VIEW = 0.5
 # Least number of repeated images that is reported: one or two are no habit of a driver.
 # [chosen: 3 to 10 would do]
 _REPORTED = 3
@@ -120,7 +125,9 @@ class StillView:
             measured = {'repeated': repeated, 'images': len(self._repeated)}
             found.append(_still(Code.REPEATED_IMAGES, measured))
         if self.static.any():
-            found.append(_still(Code.STATIC_REGION, self._extent()))
+            extent = self._extent()
+            is_most = extent['share'] >= _MOST_OF_VIEW
+            found.append(_still(Code.INTERIOR if is_most else Code.STATIC_REGION, extent))
         return tuple(found)
 
     def _extent(self) -> dict[str, Any]:
@@ -146,7 +153,15 @@ def _range(are_static: Flags, size: int) -> list[int]:
 
 
 def _still(code: Code, measured: dict[str, Any]) -> Finding:
-    return Finding(code, FindingState.SUSPECT, Why.STILL, evidence=Evidence(measured=measured))
+    """A finding on what does not move; what covers most of a lens looks like an interior."""
+    fitting = (Code.INTERIOR, Code.STATIC_REGION) if code is Code.INTERIOR else ()
+    return Finding(
+        code,
+        FindingState.SUSPECT,
+        Why.STILL,
+        evidence=Evidence(measured=measured),
+        candidates=fitting,
+    )
 
 
 def _motion_of_cells(previous: FrameImu, current: FrameImu, sensor: Sensor) -> Array:
