@@ -341,50 +341,45 @@ def _run_live(args: argparse.Namespace) -> int:
                 '--against plays the cells as every release can: without --soak, --every and '
                 '--neighbours'
             )
-        if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
-            raise InputError(
-                f'--against {args.against} is no checkout of this package: give the '
-                'folder that contains rs_relpose_ros'
-            )
-        with progress_bar(2 * live.TURNS * len(names), 'run') as bar:
-            return _print_report(
-                live.compare_checkouts(
-                    Path(__file__).resolve().parents[2],
-                    args.against,
-                    names,
-                    args.duration,
-                    args.output,
-                    bar.update,
-                ),
-                args.output,
-            )
-    profile = _shipped('fastdds.xml')
+        return _compare_checkouts(names, args)
     sizes = sorted({(cell.width, cell.height) for cell in cells})
     with progress_bar(len(sizes) * round(FPS * PERIOD), 'frame', 'rendering') as bar:
         clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
-    results, failed = [], False
+    results = []
     with progress_bar(round(len(cells) * load.duration), 's') as bar:
         for cell in cells:
             bar.set_description(cell.name)
+            folder = args.output / cell.name
+            clip = clips[cell.width, cell.height]
+            profile = _shipped('fastdds.xml')
             try:
-                statistics, course = live.run_cell(
-                    cell,
-                    clips[cell.width, cell.height],
-                    load,
-                    args.output / cell.name,
-                    profile,
-                    bar.update,
-                )
+                statistics, course = live.run_cell(cell, clip, load, folder, profile, bar.update)
             except RsRelposeError as error:  # the other cells are still measured
-                failed = True
                 print(f'{cell.name}: {error}', file=sys.stderr)
                 continue
             results.append(statistics)
             if args.soak:
-                print(live.write_soak_report(args.output / cell.name, statistics, course))
+                print(live.write_soak_report(folder, statistics, course))
     if results:
         _print_report(live.write_report(args.output, results), args.output)
-    return int(failed)
+    return int(len(results) < len(cells))
+
+
+def _compare_checkouts(names: Sequence[str], args: argparse.Namespace) -> int:
+    """Play the cells to this checkout and to the one of ``--against``, by turns."""
+    from rs_relpose_lab.experiments import live
+
+    if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
+        raise InputError(
+            f'--against {args.against} is no checkout of this package: give the '
+            'folder that contains rs_relpose_ros'
+        )
+    own = Path(__file__).resolve().parents[2]
+    with progress_bar(2 * live.TURNS * len(names), 'run') as bar:
+        report = live.compare_checkouts(
+            own, args.against, names, args.duration, args.output, bar.update
+        )
+    return _print_report(report, args.output)
 
 
 @_benchmark(
@@ -581,7 +576,6 @@ def _run_odometry(args: argparse.Namespace) -> int:
 
     need_gtsam()
     from rs_relpose_lab.experiments import (
-        odometry,
         odometry_disturbances,
         odometry_loops,
         odometry_recordings,
@@ -611,7 +605,15 @@ def _run_odometry(args: argparse.Namespace) -> int:
             args,
             'walk',
         )
-    walks, seed = odometry.walks, args.seed
+    return _run_walks(args)
+
+
+def _run_walks(args: argparse.Namespace) -> int:
+    """Undisturbed walks, and the corners of EuRoC."""
+    from rs_relpose_lab.experiments import odometry
+
+    walks = odometry.walks
+    seed = args.seed
     chosen = [
         *walks(args.walks, seed),
         *walks(args.global_shutter, seed, readout=0.0),
@@ -621,9 +623,9 @@ def _run_odometry(args: argparse.Namespace) -> int:
     if not chosen and args.euroc is None:
         raise InputError('there is nothing to measure: give --walks or --euroc')
     args.output.mkdir(parents=True, exist_ok=True)
-    known = (
-        [] if args.euroc is None else [odometry.on_euroc(args.euroc, args.output / 'euroc.png')]
-    )
+    known = []
+    if args.euroc is not None:
+        known.append(odometry.on_euroc(args.euroc, args.output / 'euroc.png'))
     if not chosen:
         return _print_report(odometry.write_report(args.output, known), args.output)
     return _report_of(

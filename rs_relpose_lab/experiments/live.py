@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import csv
 from dataclasses import dataclass
 import os
@@ -297,107 +297,66 @@ def _percent(first: ProcessMetrics, last: ProcessMetrics, name: str) -> float:
 # -- tables of the live benchmark -----------------------------------------------------------------
 
 
+_Column = Callable[[LiveStatistics], str]
+
+# Columns of the tables by their headings: messages and results of a cell.
+_COUNTS: Mapping[str, _Column] = {
+    'cell': lambda c: c.cell,
+    'sent': lambda c: f'{c.frames_sent}',
+    'lost before the node': lambda c: f'{c.frames_sent - c.frames_received}',
+    'used': lambda c: f'{c.frames_used}',
+    'dropped (overload)': lambda c: f'{c.dropped_overload}',
+    'dropped (other)': lambda c: f'{c.dropped_other}',
+    'IMU lost': lambda c: f'{c.imu_sent - c.imu_received}',
+    'poses': lambda c: f'{c.poses} of {c.pairs}',
+    'wrong': lambda c: f'{c.wrong}',
+}
+# What a cell takes of the machine.
+_LOAD: Mapping[str, _Column] = {
+    'cell': lambda c: c.cell,
+    'latency': lambda c: _two(c.latency),
+    'end to end': lambda c: _two(c.end_to_end),
+    'time of a frame': lambda c: _two(c.frame_time),
+    'CPU time of a frame': lambda c: _two(c.frame_cpu),
+    'CPU of the node': lambda c: f'{c.cpu:.0f}',
+    'of its callbacks': lambda c: f'{c.cpu_callbacks:.0f}',
+    'of the player': lambda c: f'{c.cpu_player:.0f}',
+    'memory [MB]': lambda c: f'{c.memory_start:.0f} -> {c.memory_end:.0f}',
+}
+# The start of a node, its errors, and the player's.
+_START: Mapping[str, _Column] = {
+    'cell': lambda c: c.cell,
+    'process to ready [s]': lambda c: f'{c.seconds_to_ready:.2f}',
+    'first frame to first pose [s]': lambda c: f'{c.seconds_to_pose:.2f}',
+    'R [deg]': lambda c: _two(c.rotation_error, 3),
+    't [deg]': lambda c: _two(c.translation_error, 2),
+    'player late [ms]': lambda c: _two(c.player_late, 2),
+}
+# What the words of the tables mean.
+_EXPLANATION = (
+    'Latency is that of published pairs: from the later of image and first IMU sample that covers '
+    'its last row, at the callbacks of the node, to publication. End to end is the same from '
+    'outside: from the publication of the later of the two by the player to the receipt of the '
+    'pose by a third process. A frame without keyframe pair publishes nothing and counts in the '
+    'time of a frame, which is that of all frames, from its start to its end.\n'
+)
+
+
+def _table(columns: Mapping[str, _Column], cells: Sequence[LiveStatistics]) -> str:
+    """A row of texts for each cell, below the headings."""
+    rows = [tuple(text(cell) for text in columns.values()) for cell in cells]
+    return markdown_table(tuple(columns), rows)
+
+
 def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
     """Write table, plot and report into a folder; the report."""
-    report = '\n'.join(
-        [
-            '# The live node\n',
-            (
-                f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
-                f'{platform.python_version()}; images at 30 Hz from best-effort publishers. '
-                f'Times in ms: '
-                'median / 99th percentile. CPU in percent of one core.\n'
-            ),
-            markdown_table(
-                (
-                    'cell',
-                    'sent',
-                    'lost before the node',
-                    'used',
-                    'dropped (overload)',
-                    'dropped (other)',
-                    'IMU lost',
-                    'poses',
-                    'wrong',
-                ),
-                [
-                    (
-                        c.cell,
-                        f'{c.frames_sent}',
-                        f'{c.frames_sent - c.frames_received}',
-                        f'{c.frames_used}',
-                        f'{c.dropped_overload}',
-                        f'{c.dropped_other}',
-                        f'{c.imu_sent - c.imu_received}',
-                        f'{c.poses} of {c.pairs}',
-                        f'{c.wrong}',
-                    )
-                    for c in cells
-                ],
-            ),
-            markdown_table(
-                (
-                    'cell',
-                    'latency',
-                    'end to end',
-                    'time of a frame',
-                    'CPU time of a frame',
-                    'CPU of the node',
-                    'of its callbacks',
-                    'of the player',
-                    'memory [MB]',
-                ),
-                [
-                    (
-                        c.cell,
-                        _two(c.latency),
-                        _two(c.end_to_end),
-                        _two(c.frame_time),
-                        _two(c.frame_cpu),
-                        f'{c.cpu:.0f}',
-                        f'{c.cpu_callbacks:.0f}',
-                        f'{c.cpu_player:.0f}',
-                        f'{c.memory_start:.0f} -> {c.memory_end:.0f}',
-                    )
-                    for c in cells
-                ],
-            ),
-            markdown_table(
-                (
-                    'cell',
-                    'process to ready [s]',
-                    'first frame to first pose [s]',
-                    'R [deg]',
-                    't [deg]',
-                    'player late [ms]',
-                ),
-                [
-                    (
-                        c.cell,
-                        f'{c.seconds_to_ready:.2f}',
-                        f'{c.seconds_to_pose:.2f}',
-                        _two(c.rotation_error, 3),
-                        _two(c.translation_error, 2),
-                        _two(c.player_late, 2),
-                    )
-                    for c in cells
-                ],
-            ),
-            (
-                'Latency is that of published pairs: from the later of image and first IMU '
-                'sample that '
-                'covers its last row, at the callbacks of the node, to publication. End to end '
-                'is the '
-                'same from outside: from the publication of the later of the two by the player '
-                'to the '
-                'receipt of the pose by a third process. A frame without keyframe pair publishes '
-                'nothing '
-                'and counts in the time of a frame, which is that of all frames, from its start '
-                'to its '
-                'end.\n'
-            ),
-        ]
+    setting = (
+        f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
+        f'{platform.python_version()}; images at 30 Hz from best-effort publishers. Times in ms: '
+        'median / 99th percentile. CPU in percent of one core.\n'
     )
+    tables = [_table(columns, cells) for columns in (_COUNTS, _LOAD, _START)]
+    report = '\n'.join(['# The live node\n', setting, *tables, _EXPLANATION])
     write_table(folder, 'live', cells, report)
     return report
 
