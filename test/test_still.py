@@ -88,6 +88,38 @@ def test_a_camera_at_rest_repeats_nothing():
     assert not any(added(parts, k, image, np.array([0.3, 0.2])) for k in range(50))
 
 
+def test_repeated_images_are_found_where_the_camera_does_not_turn():
+    """What repetitions look like is known from the seconds in which the camera turned."""
+    parts, before, rng = StillParts(), None, np.random.default_rng(5)
+    verdicts = []
+    for number, (place, image) in enumerate(walk(60)):
+        motion = np.zeros(2) if before is None else place - before
+        rotation = -motion if number < 30 else np.zeros(2)  # from then on by translation alone
+        added(parts, 3 * number, image, rotation)
+        before = place
+        noise = 0.8 * rng.normal(size=image.shape)
+        copy = np.clip(image + noise, 0, 255).astype(np.uint8)
+        turn = -np.array([4.0, 2.0]) if number < 30 else np.zeros(2)
+        verdicts.append(added(parts, 3 * number + 1, copy, turn))
+    assert np.mean(verdicts[:30]) > 0.8
+    assert np.mean(verdicts[30:]) > 0.9
+
+
+def test_a_camera_at_rest_after_repetitions_is_not_silent():
+    parts, rng = StillParts(), np.random.default_rng(6)
+    images = list(walk(21))
+    for number, (_, image) in enumerate(images):
+        added(parts, 2 * number, image, (9.0, 4.0))
+        copy = np.clip(image + rng.normal(size=image.shape), 0, 255).astype(np.uint8)
+        added(parts, 2 * number + 1, copy, (9.0, 4.0))
+    at_rest = images[-1][1]
+    new = []
+    for number in range(42, 102):
+        noisy = np.clip(at_rest + rng.normal(size=at_rest.shape), 0, 255).astype(np.uint8)
+        new.append(not added(parts, number, noisy, (0.0, 0.0)))
+    assert 3 <= sum(new) <= 10  # twice a second
+
+
 @pytest.mark.parametrize('motion', [1e7, 1e12, np.inf])
 def test_a_motion_out_of_the_image_tells_nothing(motion):
     """A gyro in deg/s predicts motions of many widths: no verdict, and no endless reflection."""

@@ -10,6 +10,7 @@ would make:
 with I_j the last image that was new, I_k the current image, both reduced in size, and W(I_j) the
 image I_j moved by the rotation. A cell is informative where E is large, and still where D is small
 against E. An image whose informative cells are all still is a repetition of the image before.
+Where the camera hardly turns, one that has changed as little as known repetitions did is, too.
 A cell that is still in most of the images of some seconds, and also against an image of half a
 second before, is static: an object that moves slowly is not.
 """
@@ -49,6 +50,20 @@ _INFORMATIVE = 0.2
 # Least share of the informative cells that have to be still in a repeated image. A window in the
 # cabin of a vehicle moves in a smaller share. [chosen: a few cells may flicker]
 _ALL = 0.97
+# Number of the last repeated images whose change [gray levels] is kept. More follow a new quality
+# of compression later. [chosen: 10 to 100 would do]
+_ALIKE_KEPT = 30
+# Least number of these with which an image is compared where the rotation tells nothing. Fewer
+# may be a chance. [chosen: 3 to 10 would do]
+_ALIKE_LEAST = 3
+# Largest change of an image, in units of the median change of repeated images, that is a
+# repetition, too. A larger one takes slow motion for none. [measured: copies of a walk change by
+# 0.98 to 1.02, other images by 8.8 at least]
+_ALIKE = 2.0
+# Longest time [ns] for which images that are alike count as repetitions of the last new one: a
+# camera at rest sends such images, too. A longer one hides the rest, a shorter one takes the image
+# of a frozen driver for new. [chosen: 0.2 to 1 s would do]
+_ALIKE_NS = to_nanoseconds(0.5)
 # Time over which cells are counted [ns]. In a shorter time a person may keep one point of the
 # scene at its place in the image. [chosen: 3 to 10 s would do]
 _WINDOW_NS = to_nanoseconds(5.0)
@@ -73,6 +88,8 @@ class StillParts:
     def reset(self) -> None:
         """Forget all images."""
         self._before: NDArray[np.float32] | None = None  # the last new image, reduced
+        self._before_ns = 0  # its stamp
+        self._alike: deque[float] = deque(maxlen=_ALIKE_KEPT)  # changes of repeated images
         # Two images of before with their stamps: the older one is that for comparison.
         self._earlier: list[tuple[int, NDArray[np.float32]]] = []
         self._counted: deque[tuple[int, Flags, Flags]] = deque()
@@ -94,15 +111,29 @@ class StillParts:
         before = self._before
         if before is None or before.shape != reduced.shape:
             self._before = reduced
+            self._before_ns = stamp_ns
             return False
         informative, expected, still = _compared(before, reduced, motion * scale)
         enough = informative.mean() >= _INFORMATIVE
-        repeated = bool(enough and still[informative].mean() >= _ALL)
+        change = float(np.abs(reduced - before).mean())
+        if enough:
+            repeated = bool(still[informative].mean() >= _ALL)
+            if repeated:
+                self._alike.append(change)
+        else:
+            repeated = self._is_alike(stamp_ns, change)
         if not repeated:
             lasting = self._lasts(stamp_ns, reduced, expected)
             self._count(stamp_ns, informative, still & lasting)
             self._before = reduced
+            self._before_ns = stamp_ns
         return repeated
+
+    def _is_alike(self, stamp_ns: int, change: float) -> bool:
+        """Whether an image has changed as little [gray levels] as known repetitions did."""
+        if len(self._alike) < _ALIKE_LEAST or stamp_ns - self._before_ns > _ALIKE_NS:
+            return False
+        return change <= _ALIKE * float(np.median(self._alike))
 
     def _lasts(self, stamp_ns: int, reduced: NDArray[np.float32], expected: Array) -> Flags:
         """Which cells are as in an image of at least `_EARLIER_NS` before; none without one.
