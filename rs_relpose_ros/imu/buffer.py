@@ -93,11 +93,13 @@ class Series:
             self._start = 0
             self._end = len(stamps)
         at = self._start + position
-        later = slice(at, self._end)
-        moved = slice(at + 1, self._end + 1)
-        for column, new in ((self._stamps, stamp_ns), (self._values, value)):
-            column[moved] = column[later]
-            column[at] = new
+        if at < self._end:
+            later = slice(at, self._end)
+            moved = slice(at + 1, self._end + 1)
+            for column in (self._stamps, self._values):
+                column[moved] = column[later]
+        self._stamps[at] = stamp_ns
+        self._values[at] = value
         self._end += 1
         return True
 
@@ -146,8 +148,11 @@ class Series:
         stamps = self.stamps
         if len(stamps) == 0:
             return Coverage.NOT_YET
-        steps = np.diff(self.enclosing(start_ns, end_ns))
-        if start_ns < stamps[0] or (steps > self._gap_ns).any():
+        if start_ns < stamps[0]:
+            return Coverage.NEVER
+        known = self.enclosing(start_ns, end_ns)
+        steps = known[1:] - known[:-1]  # np.diff takes longer than all the rest
+        if (steps > self._gap_ns).any():
             return Coverage.NEVER
         return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
 

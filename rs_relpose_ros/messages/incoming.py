@@ -286,20 +286,12 @@ class StuckGyro:
             self._add(axis, value, sample.stamp_ns)
         count = min(self._counts)
         since_ns = max(self._since_ns)
-        fault = (
-            'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
-            'for a simulation without noise)'
-        )
         clipped = self._clipped_axis(rate) if count == 1 else None
         if clipped is not None:
             count = self._counts[clipped]
             since_ns = self._since_ns[clipped]
-            fault = (
-                f'the {"xyz"[clipped]} axis of the gyro repeats {rate[clipped]:.4g} rad/s bit by '
-                'bit: it is saturated'
-            )
         if count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns:
-            raise InputError(fault)
+            raise InputError(_fault(clipped, rate))
         return count > 1
 
     def _add(self, axis: int, value: float, stamp_ns: int) -> None:
@@ -318,6 +310,19 @@ class StuckGyro:
             if self._counts[axis] > 1 and abs(value) >= clipping:
                 return axis
         return None
+
+
+def _fault(clipped: int | None, rate: tuple[float, float, float]) -> str:
+    """Text about a gyro that repeats its values, or those of the axis that is `clipped`."""
+    if clipped is None:
+        return (
+            'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
+            'for a simulation without noise)'
+        )
+    return (
+        f'the {"xyz"[clipped]} axis of the gyro repeats {rate[clipped]:.4g} rad/s bit by '
+        'bit: it is saturated'
+    )
 
 
 # -- Into the sequencer, live and offline ---------------------------------------------------------
