@@ -487,7 +487,7 @@ def test_the_scatter_is_that_of_the_stamps_whether_or_not_frames_are_lost(frames
     rng, found = np.random.default_rng(0), []
     for _ in range(300):
         kept = np.delete(jittering(rng, frames), rng.choice(frames, lost, replace=False))
-        found.append(module.stamp_sigma(kept[-module.SCATTER_FRAMES :]))
+        found.append(module.stamp_scatter(kept[-module.SCATTER_FRAMES :]).sigma)
     assert np.mean(found) == pytest.approx(2.0e-3, rel=0.15)
 
 
@@ -504,4 +504,46 @@ def test_the_scatter_is_that_of_the_stamps_whether_or_not_frames_are_lost(frames
     ],
 )
 def test_the_scatter_is_small_without_errors_and_bounded(stamps_ns, most):
-    assert module.stamp_sigma(stamps_ns) <= most
+    scatter = module.stamp_scatter(stamps_ns)
+    assert scatter.sigma <= most and not scatter.is_jitter
+
+
+def delays(kind, mean, rng, count=32):
+    """One-sided delays [s] with a mean, as of a busy computer."""
+    if kind == 'exponential':
+        return rng.exponential(mean, count)
+    if kind == 'mixture':  # mostly short, sometimes long
+        is_long = rng.random(count) < 0.2
+        return rng.exponential(np.where(is_long, 4.0 * mean, 0.25 * mean))
+    return rng.uniform(0.0, 2.0 * mean, count)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'mean', 'least'),
+    [
+        *(('exponential', mean, 0.75) for mean in (0.002, 0.005, 0.009)),
+        *(('uniform', mean, 0.85) for mean in (0.003, 0.007, 0.015)),
+        # Delays of most of an interval are partly taken for lost frames, or come in another order.
+        ('exponential', 0.015, 0.6),
+        ('mixture', 0.001, 0.6),
+        ('mixture', 0.003, 0.4),
+    ],
+)
+def test_one_sided_delays_are_jitter_of_their_size(kind, mean, least):
+    rng = np.random.default_rng(round(1e6 * mean))
+    sigmas, found = [], []
+    for _ in range(200):
+        late = delays(kind, mean, rng)
+        stamps_ns = np.sort(EVEN[:32] + np.round(1e9 * late).astype(np.int64))
+        found.append(module.stamp_scatter(stamps_ns))
+        sigmas.append(late.std())
+    ratio = np.mean([one.sigma for one in found]) / np.mean(sigmas)
+    assert least < ratio < 1.25
+    share = np.mean([one.is_jitter for one in found])
+    assert share > 0.5 if np.mean(sigmas) > 0.0035 else share < 0.7
+
+
+def test_a_camera_that_is_triggered_irregularly_has_no_jitter():
+    rng = np.random.default_rng(6)
+    irregular = [np.cumsum(rng.integers(25_000_000, 41_000_000, 32)) for _ in range(200)]
+    assert np.mean([module.stamp_scatter(one).is_jitter for one in irregular]) < 0.06

@@ -740,6 +740,13 @@ def noise_of_gyro(pair: PairData, configured: Configured) -> Finding | None:
     )
 
 
+def jitter_of_stamps(sigma: float) -> Finding:
+    """The finding that images are stamped on arrival, with the scatter [s] of the stamps."""
+    return Finding(
+        Code.STAMP_JITTER, FindingState.SUSPECT, Why.OFF, (0.0,), (sigma,), 0.2 * sigma, 's'
+    )
+
+
 # -- A test that presupposes no cause -------------------------------------------------------------
 #
 # Each pair has a score in the deviations of the configuration. At the deviations that fit all

@@ -79,6 +79,7 @@ class Code(str, Enum):
     UNKNOWN_CAUSE = 'unknown_cause'
     # Causes that the odometry names.
     GYRO_NOISE = 'gyro_noise'
+    STAMP_JITTER = 'stamp_jitter'
     ACCEL_NOISE = 'accel_noise'
     KNOCK = 'knock'
     # Properties of a recording: `is_property`.

@@ -425,6 +425,16 @@ def _noise_of_imu(finding: Finding) -> Text:
     )
 
 
+def _jitter(finding: Finding) -> Text:
+    assert finding.estimate is not None
+    return Text(
+        f'images are stamped on arrival, or when a program had time: the stamps scatter by '
+        f'{1e3 * finding.estimate:.1f} ms about an even rhythm (jitter), which is in the '
+        'covariance of each pose',
+        'have the driver stamp images with the time of their exposure, on the clock of the IMU',
+    )
+
+
 def _knock(finding: Finding) -> Text:
     measured = finding.evidence.measured
     return Text(
@@ -448,6 +458,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.UNKNOWN_CAUSE, Why.RESIDUALS): _pattern,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,
+    (Code.STAMP_JITTER, Why.OFF): _jitter,
     (Code.KNOCK, Why.OFF): _knock,
     (Code.READOUT_DIRECTION, Why.OFF): _direction_off,
     (Code.READOUT_DIRECTION, Why.BY_CALIBRATION): _direction_by_calibration,

@@ -94,6 +94,7 @@ class PairData:
     segment: ImuSlice  # between the stamped rows
     R_cam_imu: Array
     gyro_sigma: float  # [rad/s] of the rate within a frame
+    stamp_sigma: float = 0.0  # [s] of the stamp of each image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +198,15 @@ def thinned(pair: PairData, at: Array) -> PairData:
 
 
 def problem_of(pair: PairData) -> TwoViewProblem:
-    """The pair at its middle rows, its rotation known by the gyro up to its noise."""
+    """The pair at its middle rows, its rotation known by the gyro up to its noise and the stamps.
+
+    Errors of the stamps are errors of the times between which the gyro is integrated.
+    """
+    covariance = pair.segment.noise_covariance + _LEAST_ROTATION_SIGMA**2 * np.eye(3)
+    if pair.stamp_sigma:
+        rates = pair.segment.angular_velocities[[0, -1]].T
+        rates = np.column_stack([rates[:, 0], pair.segment.rotation @ rates[:, 1]])
+        covariance = covariance + pair.stamp_sigma**2 * rates @ rates.T
     return build_problem(
         pair.points1,
         pair.points2,
@@ -205,7 +214,7 @@ def problem_of(pair: PairData) -> TwoViewProblem:
         pair.motion1,
         pair.motion2,
         pair.segment.rotation,
-        pair.segment.noise_covariance + _LEAST_ROTATION_SIGMA**2 * np.eye(3),
+        covariance,
     )
 
 

@@ -107,6 +107,7 @@ class ConsistencyMonitor:
         self._likely = np.zeros(LIVE.size)  # about which pairs are linearised
         self._undetermined: Array | None = None  # by the pairs before
         self.stamp_sigma = 0.0  # [s] scatter of the stamps of the last frames
+        self.jitter = 0.0  # [s] the same where images are stamped on arrival, otherwise 0
         self._gross: tuple[Finding, ...] = ()
         self.image_findings: tuple[Finding, ...] = ()  # of what is in view
         self._noise: Finding | None = None  # of the gyro, by its samples of the last pair
@@ -250,8 +251,10 @@ class ConsistencyMonitor:
             others = assessment.not_evaluated(set(), self._noise.code)
             self.health = Assessment((self._noise, *others))
         self._wrong_configuration = bool(self.health.faults)
-        # Nor are velocities of rotations that contradict the gyro.
-        if self._wrong_configuration or self.contradictions.counts[0] > _MOST_REJECTED:
+        # Nor are velocities of rotations that contradict the gyro, or of frames with own errors.
+        has_errors = bool(self.jitter) or self._noise is not None
+        contradicts = self.contradictions.counts[0] > _MOST_REJECTED
+        if self._wrong_configuration or contradicts or has_errors:
             self.acceleration.clear()
         self._add_others(due.stamp_ns)
         self.residuals.test_in_turn()
@@ -267,6 +270,8 @@ class ConsistencyMonitor:
         found = (*found, *self._of_changes(stamp_ns))
         if self._noise is not None and self._noise not in found:
             found = (*found, self._noise)
+        if self.jitter:
+            found = (*found, assessment.jitter_of_stamps(self.jitter))
         # A gyro of another unit moves images elsewhere: parts seem still by chance.
         if not any(one.code is findings.Code.GYRO_UNIT for one in found):
             found = (*found, *self.image_findings)

@@ -47,7 +47,12 @@ from rs_relpose_ros.pipeline.pair import (
     Result,
     TrackHistory,
 )
-from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
+from rs_relpose_ros.pipeline.sequencer import (
+    FrameRefused,
+    SCATTER_FRAMES,
+    Sequencer,
+    stamp_scatter,
+)
 from rs_relpose_ros.pipeline.still_view import StillView
 from rs_relpose_ros.tracking.features import make_tracker, Tracker
 from rs_relpose_ros.tracking.images import Image
@@ -58,6 +63,9 @@ _ROTATION_POINTS = 120
 # Number of frames from one comparison to the next. With one, the noise of the points is as large
 # as the rotation; with many, few tracks are left. [chosen: a tenth of a second at 30 Hz]
 _ROTATION_FRAMES = 3
+# Last pairs whose largest jitter counts: late images come now and then. Fewer would publish pairs
+# between them as exact, more would widen poses long after a busy moment. [chosen: 5 to 20 s]
+_JITTER_PAIRS = 60
 # Least time between two published pairs with too few matches [s]: in the dark each frame creates
 # one. [chosen: two a second are enough for a display]
 _UNMATCHED_PERIOD = 0.5
@@ -69,6 +77,11 @@ _CONTRADICTING = 'the images of most of the last pairs contradict the gyro, what
 _UNTESTED = (
     'the images contradict the gyro, and few pairs before agree with it: the configuration is '
     'being tested'
+)
+# Reason for a pair of two views alone where each frame has errors. [derived: text for people]
+_BY_TWO_VIEWS = (
+    'the frames of the pair do not fit each other, as stamps jitter or the gyro has noise '
+    '(see health)'
 )
 # Reason for a pair that may follow an object. [derived: text for people]
 _TWO_MOTIONS = (
@@ -131,6 +144,7 @@ class Pipeline(Processor[PairResult]):
         self._sensor: Sensor | None = None
         self._readout = 0.0  # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
+        self._jitters: deque[float] = deque(maxlen=_JITTER_PAIRS)  # [s] of images on arrival
         self._lesson: Lesson | None = None  # of the last pair
         self._compare: Callable[[], None] | None = None  # after a pair
         self.reset()
@@ -353,7 +367,11 @@ class Pipeline(Processor[PairResult]):
         since = history.since
         assert since is not None
         matches = self._tracker.refined_matches()
-        monitor.stamp_sigma = math.hypot(stamp_sigma(self._stamps_ns), frame.imu_doubt.varying)
+        scatter = stamp_scatter(self._stamps_ns)
+        self._jitters.append(scatter.sigma if scatter.is_jitter else 0.0)
+        monitor.jitter = max(self._jitters)
+        sigma = max(scatter.sigma, monitor.jitter)
+        monitor.stamp_sigma = math.hypot(sigma, frame.imu_doubt.varying)
         problem = history.problem(
             frame.stamp_ns,
             matches,
@@ -388,13 +406,9 @@ class Pipeline(Processor[PairResult]):
         sums_of = _residual_sums(frame, rays, pose, sensor)
         self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured, sums_of))
         if parameters.pair.withhold_when_wrong:
-            pose = suppressed(pose, monitor.health)
+            pose = self._without_doubtful(pose, problem)
             if doubtful:
                 pose = withheld(pose, _STEP_SOUGHT)
-            if monitor.contradictions.is_untested:
-                pose = withheld(pose, _UNTESTED)
-            if monitor.contradictions.too_many:
-                pose = withheld(pose, _CONTRADICTING)
             if follows_object:
                 pose = withheld(pose, _TWO_MOTIONS)
         return replace(
@@ -403,6 +417,20 @@ class Pipeline(Processor[PairResult]):
             lesson=self._lesson,
             image2=frame.image if self._keep_images else None,
         )
+
+    def _without_doubtful(self, pose: RelativePose, problem: PairProblem) -> RelativePose:
+        """The pose, unless it is wrong, or no test says that its covariance holds."""
+        monitor = self._monitor
+        pose = suppressed(pose, monitor.health)
+        if monitor.contradictions.is_untested:
+            pose = withheld(pose, _UNTESTED)
+        if monitor.contradictions.too_many:
+            pose = withheld(pose, _CONTRADICTING)
+        # Two views have no test, and no part of the covariance, for errors of single frames.
+        has_errors = problem.rate_doubt > 0.0 or monitor.jitter > 0.0
+        if has_errors and not math.isfinite(pose.diagnostics.gyro_square):
+            pose = withheld(pose, _BY_TWO_VIEWS)
+        return pose
 
     def _learn(
         self,
@@ -534,6 +562,7 @@ def _measurement(
         since,
         parameters.sensor.R_cam_imu,
         problem.config.gyro_sigma,
+        problem.config.stamp_sigma,
     )
 
 

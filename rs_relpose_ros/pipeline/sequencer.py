@@ -12,13 +12,13 @@ from enum import Enum
 import math
 import threading
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import timing
+from rs_relpose_ros.geometry import Array, timing
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import (
@@ -557,28 +557,75 @@ SCATTER_FRAMES = 32
 # The interval at this quantile of all contains no lost frame.
 # [derived: less than three of four intervals are lost or doubled]
 _WHOLE = 0.25
-# A larger scatter, as a share of the interval, is a camera without a rhythm.
-# [chosen: phones scatter by some ms of 33]
+# A larger scatter, as a share of the interval, is a camera without a rhythm, or one whose images
+# are stamped on arrival. [chosen: phones scatter by some ms of 33]
 _LARGEST_SHARE = 0.1
+# Correlation of consecutive intervals below which stamps are late: an interval that is too long
+# makes the next one too short. A lower one would miss jitter, a higher one would take a camera
+# that is triggered irregularly for one. [derived: -0.5 for errors of the stamps, 0 for a camera
+# without a rhythm, both within 0.18 of 31 intervals]
+_ALTERNATING = -0.3
+# Fewest intervals that show it. [chosen: 8 to 15 would do]
+_FEWEST_INTERVALS = 8
+# Part of the usual interval by which an interval is long or short. Less would take the scatter of
+# a phone for frames that are late, more would take late frames for lost ones.
+# [chosen: 0.15 to 0.3 would do: 8 ms of 33]
+_CLEARLY = 0.25
+# Such frames among the last ones that show jitter. [chosen: one may be a moment of load]
+_FEWEST_LATE = 2
+# Mean magnitude of a normal variable by its sigma. [derived: sqrt(2 / pi)]
+_MEAN_BY_SIGMA = math.sqrt(2.0 / math.pi)
+# Sigma of the change from one interval to the next by that of a stamp. [derived: 1 + 4 + 1]
+_CHANGE_BY_STAMP = math.sqrt(6.0)
 
 
-def stamp_sigma(stamps_ns: Sequence[int]) -> float:
+class StampScatter(NamedTuple):
+    """Scatter of the stamps of images about an even rhythm."""
+
+    sigma: float  # [s] of a stamp
+    is_jitter: bool  # whether stamps are late by much of an interval, as times of arrival are
+
+
+def stamp_scatter(stamps_ns: Sequence[int]) -> StampScatter:
     """1 sigma of a stamp [s]; 0 for fewer than three stamps.
 
     Intervals d_i of stamps, corrected for lost frames, change by
     ``d_i+1 - d_i = e_i+2 - 2 e_i+1 + e_i`` for errors e of the stamps: six times their variance.
-    A change of the rhythm, as by auto exposure, affects one of these differences only; hence their
-    mean magnitude and not their variance.
+    A change of the rhythm, as by auto exposure, affects one of these differences only: the
+    largest is left out of their mean square, which delays of single stamps make larger than their
+    mean magnitude. Where stamps are late, intervals are not corrected: a late frame is not lost.
     """
     intervals = np.diff(np.array(stamps_ns)) / NANOSECONDS
     count = len(intervals)
     if count < 2:
-        return 0.0
+        return StampScatter(0.0, is_jitter=False)
     period = float(np.sort(intervals)[int(_WHOLE * (count - 1))])
     if not period > 0.0:
-        return 0.0
-    corrected = intervals - np.round(intervals / period) * period
-    changes = np.abs(np.diff(corrected))
-    # Mean magnitude of a normal variable: sqrt(2 / pi) sigma.
-    sigma = float(np.sqrt(np.pi / 2.0) * changes.mean() / np.sqrt(6.0))
-    return min(sigma, _LARGEST_SHARE * period)
+        return StampScatter(0.0, is_jitter=False)
+    sigma = _sigma_of_changes(intervals - np.round(intervals / period) * period)
+    if _alternates(intervals) and (sigma > _LARGEST_SHARE * period or _comes_late(intervals)):
+        return StampScatter(_sigma_of_changes(intervals), is_jitter=True)
+    return StampScatter(min(sigma, _LARGEST_SHARE * period), is_jitter=False)
+
+
+def _alternates(intervals: Array) -> bool:
+    """Whether long and short intervals (N,) follow each other."""
+    if len(intervals) < _FEWEST_INTERVALS:
+        return False
+    off = np.clip(intervals / np.median(intervals) - 1.0, -1.0, 1.0)
+    return bool(np.mean(off[1:] * off[:-1]) < _ALTERNATING * np.mean(off**2))
+
+
+def _comes_late(intervals: Array) -> bool:
+    """Whether some intervals (N,) are as short as the one before is long: no frame is lost."""
+    off = intervals / np.median(intervals) - 1.0
+    late = (off[1:] < -_CLEARLY) & (off[:-1] > _CLEARLY)
+    return bool(np.count_nonzero(late) >= _FEWEST_LATE)
+
+
+def _sigma_of_changes(intervals: Array) -> float:
+    """1 sigma of a stamp [s] by the changes of intervals (N,)."""
+    changes = np.sort(np.abs(np.diff(intervals)))
+    of_mean = float(changes.mean()) / _MEAN_BY_SIGMA
+    of_squares = math.sqrt(float(np.mean(changes[:-1] ** 2))) if len(changes) > 1 else 0.0
+    return max(of_mean, of_squares) / _CHANGE_BY_STAMP
