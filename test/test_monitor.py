@@ -1361,6 +1361,35 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
             assert max(beyond_covariance(result, truth, round(1e9 * case.stamps_late))) < 1.0, k
 
 
+@pytest.mark.parametrize('scale', [1.0, 1.05, 0.8])
+def test_a_scale_of_the_accelerometer_is_in_the_doubt_of_baselines_or_named(
+    bundled_bag, monkeypatch, scale
+):
+    role, change = imu_with(force=scale * UNCHANGED)
+    part = incoming.PARTS[role]
+    results, _ = replayed(bundled_bag, 'accel_scale_sigma=0.0', pairs=20)
+    read = lambda message: change(part.read(message))  # noqa: E731
+    monkeypatch.setitem(incoming.PARTS, role, incoming.Part(part.msgtypes, read))
+    scaled, _ = replayed(bundled_bag, 'accel_scale_sigma=0.04', pairs=20)
+    both = [
+        (one.pose, other.pose)
+        for one, other in zip(results, scaled, strict=True)
+        if math.isfinite(one.pose.baseline + other.pose.baseline)
+    ]
+    assert len(both) > 8
+    longer = [math.log(other.baseline / one.baseline) for one, other in both]
+    wider = [
+        other.baseline_log_sigma / math.hypot(one.baseline_log_sigma, 0.04) for one, other in both
+    ]
+    assert np.median(longer) == pytest.approx(math.log(scale), abs=0.02)
+    assert np.median(wider) == pytest.approx(1.0, abs=0.05)
+    named = [fault for fault in scaled[-1].health.faults if fault.code is Code.ACCEL_SCALE]
+    assert bool(named) == (scale == 0.8)
+    if named:
+        assert named[0].estimate == pytest.approx(1.0 / scale, rel=0.03)
+        assert 'at rest' in text_of(named[0]).message
+
+
 def test_a_pair_is_published_before_its_assessment(bundled_bag, monkeypatch):
     """Its health is that of the pairs before; the one that reveals a fault has a pose."""
     assessed, assess = [ConsistencyMonitor().health], ConsistencyMonitor.assess

@@ -273,6 +273,15 @@ def _no_specific_force(finding: Finding) -> Text:
     return Text(fault.message, fault.fix)
 
 
+def _scale_of_force(finding: Finding) -> Text:
+    length = finding.evidence.measured['mean_length_m_s2']
+    return Text(
+        f'the accelerometer measures {length:.2f} m/s^2 at rest: true forces are '
+        f'{finding.estimate:.3f} times as large, and so are baselines in metres',
+        'calibrate the accelerometer (scale, bias) in the driver, or set accel_scale_sigma',
+    )
+
+
 def _with_the_images(finding: Finding) -> str:
     return f'with the images (log-likelihood {finding.evidence.log_likelihood:+.0f})'
 
@@ -476,6 +485,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.TIME_OFFSET, Why.CLOCKS_APART): _clocks_apart,
     (Code.TIME_OFFSET, Why.AT_OTHER_TIME): _at_other_time,
     (Code.ACCEL_SCALE, Why.NO_SPECIFIC_FORCE): _no_specific_force,
+    (Code.ACCEL_SCALE, Why.OFF): _scale_of_force,
     (Code.ACCEL_AXES, Why.CONSISTENT): _accelerometer,
     (Code.ACCEL_AXES, Why.OPPOSITE): _contradicting_accelerometer,
     (Code.ACCEL_AXES, Why.OFF): _contradicting_accelerometer,

@@ -15,7 +15,7 @@ from rs_relpose_ros.core.losses import cauchy_weight
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
 from rs_relpose_ros.imu.integration import interpolated
@@ -244,6 +244,11 @@ _CERTAIN = 10.0
 _FAULTY_NS = to_nanoseconds(1.0)
 
 
+# Sigmas of the length at rest beyond which the accelerometer has another scale. Fewer would name
+# the bias of a cheap sensor. [derived: as of any parameter with a configured sigma]
+_BEYOND = 3.0
+
+
 class AccelerationSums(LastSeconds):
     """Log Bayes factors of the measured acceleration and of its opposite, with their stamps."""
 
@@ -253,6 +258,15 @@ class AccelerationSums(LastSeconds):
         self._fault: ForceFault | None = None
         self._fault_ns = 0
         self._faulty = False
+        # Length of the specific force at rest, and what it may differ by from that of gravity.
+        self._length = self._length_sigma = math.nan
+
+    def note_length(self, length: float, sigma: float) -> None:
+        """Note the length of the specific force at rest [m/s^2]; NaN if it is not known.
+
+        `sigma`: of its difference from gravity, if scale and bias are as configured.
+        """
+        self._length, self._length_sigma = length, sigma
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
         """Note the acceleration of a pair, or the reason why it has none."""
@@ -285,6 +299,16 @@ class AccelerationSums(LastSeconds):
                 FindingState.SUSPECT,
                 Why.NO_SPECIFIC_FORCE,
                 evidence=Evidence(measured=measured),
+            )
+        if abs(self._length - STANDARD_GRAVITY) > _BEYOND * self._length_sigma:
+            return Finding(
+                Code.ACCEL_SCALE,
+                FindingState.SUSPECT,
+                Why.OFF,
+                configured=(1.0,),
+                estimated=(STANDARD_GRAVITY / self._length,),
+                sigma=self._length_sigma / self._length,
+                evidence=Evidence(measured={'mean_length_m_s2': self._length}),
             )
         configured, opposite = self._sums()
         evidence = Evidence(pairs=len(self), log_likelihood=configured)

@@ -257,6 +257,13 @@ class ImuConfig(Settings):
         low=0.0,
         high=10.0,
     )
+    accel_scale_sigma: float = setting(
+        0.03,
+        'scale of the accelerometer, 1 sigma: published baselines have at least this relative '
+        'sigma',
+        low=0.0,
+        high=1.0,
+    )
     imu_position: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0),
         'position of the IMU in the camera frame',

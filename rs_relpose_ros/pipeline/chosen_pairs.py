@@ -18,6 +18,7 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import pair
+from rs_relpose_ros.pipeline.monitor import with_scale_doubt
 from rs_relpose_ros.pipeline.pair import Frame, PairResult, TrackHistory, used_frames
 from rs_relpose_ros.pipeline.pipeline import Processor
 from rs_relpose_ros.tracking.features import DescriptorTracker
@@ -101,7 +102,8 @@ def estimate_wide_pair(
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
     history, matches = _matched(first, second, parameters.tracking, between if near else ())
-    pose = estimate(history.problem(second.stamp_ns, matches, sensor, parameters, near=near))
+    problem = history.problem(second.stamp_ns, matches, sensor, parameters, near=near)
+    pose = with_scale_doubt(estimate(problem), parameters.imu)
     rays = pair.derotated(matches, first.imu.motion, second.imu.motion, sensor)
     return history.result(second, rays, pose, sensor, parameters)
 

@@ -29,7 +29,7 @@ from rs_relpose_ros.calibration.readout_direction import ReadoutDirections
 from rs_relpose_ros.calibration.residual_maps import ResidualMaps
 from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
 from rs_relpose_ros.calibration.second_motion import SecondMotions
-from rs_relpose_ros.config.settings import SensorConfig
+from rs_relpose_ros.config.settings import ImuConfig, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
@@ -433,6 +433,16 @@ def _finding_of_drift(code: Code, change: Change, rate: float, unit: str) -> Fin
         unit=unit,
         evidence=evidence,
     )
+
+
+def with_scale_doubt(pose: RelativePose, imu: ImuConfig) -> RelativePose:
+    """The pose with the doubt of the accelerometer's scale in its baseline.
+
+    Gravity has the length that the sensor itself measures, so that the acceleration, and the
+    baseline with it, has the scale of the sensor. Nothing in a pair tells it.
+    """
+    log_sigma = math.hypot(pose.baseline_log_sigma, imu.accel_scale_sigma)
+    return replace(pose, baseline_log_sigma=log_sigma) if math.isfinite(log_sigma) else pose
 
 
 def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:

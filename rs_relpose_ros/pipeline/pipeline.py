@@ -18,7 +18,7 @@ from rs_relpose_ros.calibration.findings import Configured
 from rs_relpose_ros.calibration.posterior import PairData
 from rs_relpose_ros.calibration.residual_maps import PairSums, View
 from rs_relpose_ros.calibration.rotations import rotation_of_rays, RotationSums
-from rs_relpose_ros.config.settings import Parameters, sensor_model, SensorConfig
+from rs_relpose_ros.config.settings import ImuConfig, Parameters, sensor_model, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
@@ -28,7 +28,7 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.geometry.so3 import log_so3, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import pair
@@ -37,6 +37,7 @@ from rs_relpose_ros.pipeline.monitor import (
     ConsistencyMonitor,
     suppressed,
     Tracked,
+    with_scale_doubt,
     withheld,
 )
 from rs_relpose_ros.pipeline.pair import (
@@ -379,7 +380,8 @@ class Pipeline(Processor[PairResult]):
             parameters,
             stamp_sigma=monitor.stamp_sigma,
         )
-        pose = self._estimated(problem, frame.stamp_ns)
+        monitor.acceleration.note_length(*_length_at_rest(frame.imu, parameters.imu))
+        pose = with_scale_doubt(self._estimated(problem, frame.stamp_ns), parameters.imu)
         # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
@@ -536,6 +538,12 @@ def _residual_sums(
     size = frame.intrinsics.image_width, frame.intrinsics.image_height
     view = View(*size, sensor.camera.readout_axis)
     return partial(PairSums.of, frame.stamp_ns, rays, pose, frame.intrinsics.fx, view)
+
+
+def _length_at_rest(imu: FrameImu, config: ImuConfig) -> tuple[float, float]:
+    """Length of the specific force at rest [m/s^2], and 1 sigma of its difference from gravity."""
+    by_scale = config.accel_scale_sigma * STANDARD_GRAVITY
+    return imu.at_rest, math.hypot(by_scale, config.accel_bias_sigma, imu.at_rest_sigma)
 
 
 def _with_step(sensor: SensorConfig, seconds: float) -> SensorConfig:
