@@ -17,7 +17,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.report.page import page
 from rs_relpose_ros.report.plots import thinned
-from rs_relpose_ros.report.residuals import epipolar_residuals, map_of, mean_rates
+from rs_relpose_ros.report.residuals import epipolar_residuals, map_of, rates_compared
 from rs_relpose_ros.report.run import is_unusable, nothing_of, Observation, observe
 
 BAG = ROOT / 'bags' / 'hand_held'
@@ -131,7 +131,7 @@ def test_the_correlation_is_best_at_the_offset(offset):
     by_images = angle(ends) - angle(ends - 0.1)
     stamps_ns = np.round(1e9 * ends).astype(np.int64)
     gyro_ns = np.round(1e9 * (times + offset)).astype(np.int64)
-    rates = mean_rates(
+    rates = rates_compared(
         [int(stamp - gyro_ns[0]) for stamp in stamps_ns],
         [0.1] * len(ends),
         by_images,

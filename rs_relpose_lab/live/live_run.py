@@ -22,7 +22,7 @@ from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
-from rs_relpose_ros.messages.outgoing import number, PAIR_TOPICS
+from rs_relpose_ros.messages.outgoing import number_text, PAIR_TOPICS
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.offline.tables import POSES, rotation_sigmas, translation_sigmas
 
@@ -108,7 +108,7 @@ class Recorder:
                         '' if reference is None else str(time_ns(reference.time_ref)),
                         str(stamp),
                         *map(
-                            number,
+                            number_text,
                             (
                                 *t,
                                 *quat_xyzw,

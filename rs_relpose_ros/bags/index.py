@@ -16,7 +16,7 @@ from rs_relpose_ros.bags import storage
 from rs_relpose_ros.bags.decoding import begins_with_header
 from rs_relpose_ros.bags.order import reading_times
 from rs_relpose_ros.bags.sensor_topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
-from rs_relpose_ros.bags.storage import Entry, StoredTopic
+from rs_relpose_ros.bags.storage import MessageEntry, StoredTopic
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 # Types of images. [derived: interface of ROS]
@@ -59,7 +59,9 @@ class IndexBuilder:
         self._numbers = numbers
         self._columns = [array('q') for _ in Index._fields]
 
-    def add(self, file: int, topics: Iterable[StoredTopic], entries: Iterable[Entry]) -> None:
+    def add(
+        self, file: int, topics: Iterable[StoredTopic], entries: Iterable[MessageEntry]
+    ) -> None:
         """Add the messages of the file of a number."""
         of_id = {
             topic.id: (

@@ -17,9 +17,9 @@ from rs_relpose_ros.bags.storage import (
     BEGIN_BYTES,
     chunk_data,
     DamagedError,
-    Entry,
     KeptChunks,
     MAX_CHUNK_BYTES,
+    MessageEntry,
     qos_profiles,
     read_exactly,
     Source,
@@ -101,7 +101,7 @@ class McapStorage:
             self._counts = Counter(entry.topic_id for entry in self.entries())
         self.topics = [self._topic(number) for number in self._channels]
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[MessageEntry]:
         """All messages in the order of the file."""
         for kind, start, size in self._records(len(Source.MCAP.value), self._end):
             if kind == _CHUNK:
@@ -122,7 +122,7 @@ class McapStorage:
         _, size = _HEAD.unpack_from(chunk, offset - _HEAD.size)
         return bytes(chunk[offset + _MESSAGE_HEAD.size : offset + size])
 
-    def _entries_of(self, place: int, size: int) -> Iterator[Entry]:
+    def _entries_of(self, place: int, size: int) -> Iterator[MessageEntry]:
         """The entries of a chunk in the file."""
         plain = self._plain_records(place, size)
         window = _Window(self._file, *plain) if plain else _Window.of(self._chunks[place])
@@ -156,7 +156,7 @@ class McapStorage:
         whole: Callable[[], bytes | memoryview],
         place: int,
         offset: int,
-    ) -> Entry:
+    ) -> MessageEntry:
         """The entry of a message, by the begin of its record or by all of it."""
         channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(begin)
         if channel not in self._channels:
@@ -164,7 +164,7 @@ class McapStorage:
         content = begin[_MESSAGE_HEAD.size :]
         if content[:4] == ZSTD_MAGIC:
             content = whole()[_MESSAGE_HEAD.size :]
-        return Entry(channel, time_ns, place, offset, content)
+        return MessageEntry(channel, time_ns, place, offset, content)
 
     def _read(self, start: int, size: int) -> bytes:
         return read_exactly(self._file, start, size)

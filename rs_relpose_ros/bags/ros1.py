@@ -20,8 +20,8 @@ from rs_relpose_ros.bags.storage import (
     BEGIN_BYTES,
     chunk_data,
     DamagedError,
-    Entry,
     KeptChunks,
+    MessageEntry,
     read_exactly,
     StoredTopic,
     UnfinishedError,
@@ -92,7 +92,7 @@ class Ros1Storage:
         if connections != len(self.topics) or chunks != len(self._places):
             raise DamagedError('its index is not complete')
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[MessageEntry]:
         """All messages in the order of the file."""
         known = {topic.id for topic in self.topics}
         for place in self._places:
@@ -106,7 +106,7 @@ class Ros1Storage:
                 if connection not in known:
                     raise DamagedError(f'a message belongs to the unknown connection {connection}')
                 content = memoryview(chunk)[data : min(start, data + BEGIN_BYTES)]
-                yield Entry(connection, _nanoseconds(fields['time']), place, data, content)
+                yield MessageEntry(connection, _nanoseconds(fields['time']), place, data, content)
 
     def data(self, place: int, offset: int) -> bytes:
         """Bytes of the message of an entry."""

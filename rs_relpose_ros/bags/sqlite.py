@@ -9,7 +9,7 @@ from urllib.parse import quote
 from rs_relpose_ros.bags.storage import (
     BEGIN_BYTES,
     DamagedError,
-    Entry,
+    MessageEntry,
     qos_profiles,
     StoredTopic,
     ZSTD_MAGIC,
@@ -49,7 +49,7 @@ class SqliteStorage:
                 ) from error
             raise DamagedError(f'SQLite reports: {error}') from error
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[MessageEntry]:
         """All messages in the order of the file."""
         # Of a large message SQLite reads all pages that a query names.
         query = (
@@ -61,7 +61,7 @@ class SqliteStorage:
                 if kind != 'blob':
                     raise DamagedError('a message has no bytes')
                 begin = self._begin(int(row)) if data is None else data
-                yield Entry(int(topic_id), int(time_ns), int(row), 0, begin)
+                yield MessageEntry(int(topic_id), int(time_ns), int(row), 0, begin)
 
     def _begin(self, row: int) -> bytes:
         """The bytes that a large message begins with; all where they are compressed."""

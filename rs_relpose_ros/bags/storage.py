@@ -79,7 +79,7 @@ class StoredTopic(NamedTuple):
     qos: tuple[Qos, ...] = ()  # of its publishers
 
 
-class Entry(NamedTuple):
+class MessageEntry(NamedTuple):
     """A message in a file: two numbers that find it again, and the bytes that it begins with."""
 
     topic_id: int
@@ -97,7 +97,7 @@ class Storage(Protocol):
 
     topics: list[StoredTopic]
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[MessageEntry]:
         """All messages in the order of the file."""
 
     def data(self, place: int, offset: int) -> bytes:

@@ -30,7 +30,7 @@ from rs_relpose_ros.bags.files import SUFFIXES
 from rs_relpose_ros.calibrate.result import as_mapping
 from rs_relpose_ros.cli.main import FAILED as EXIT_FAILED
 from rs_relpose_ros.cli.main import make_parser, package_version
-from rs_relpose_ros.cli.options import declared, PARAMETERS, progress_bar
+from rs_relpose_ros.cli.options import adding, PARAMETERS, progress_bar
 from rs_relpose_ros.cli.poses import replay_bag
 from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
 from rs_relpose_ros.config.files import read_parameters
@@ -129,7 +129,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         help='processes of this machine (default: one for each processor)',
     )
-    declared(PARAMETERS)(parser)
+    adding(PARAMETERS)(parser)
     parser.add_argument(
         '--options',
         metavar='TEXT',

@@ -91,8 +91,8 @@ def of_run(suffix: str) -> Arguments:
     return {**BAG, **PARAMETERS, **out(suffix), **TOPICS}
 
 
-def declared(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
-    """Make a function that declares arguments."""
+def adding(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
+    """Make the function that adds these arguments to a parser."""
 
     def add(parser: argparse.ArgumentParser) -> None:
         group = None

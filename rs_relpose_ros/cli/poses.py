@@ -152,7 +152,7 @@ REPLAY = Command(
     'Translations are unit vectors. Reports configured parameters (axes, time_offset, ...) that '
     'contradict images and IMU. Exit code 1: the bag was processed, but no pair has a pose, or '
     'one of these parameters is wrong.',
-    options.declared(
+    options.adding(
         {
             **options.of_run('relpose'),
             '--stamps': {
@@ -215,7 +215,7 @@ PAIRS = Command(
     'without a pose; summary.json; and errors.csv if the bag contains ground truth of the camera. '
     'The configured parameters are used as they are: run check or replay first. Exit code 1: no '
     'pair has a pose.',
-    options.declared(
+    options.adding(
         {
             **options.of_run('pairs'),
             '--list': {
@@ -306,7 +306,7 @@ ODOMETRY = Command(
     'share of states beyond 99.7 % if the bag contains ground truth of the camera. The parameter '
     'imu_position should be configured. Exit code 1: odometry did not start, or a graph could not '
     'be solved.',
-    options.declared(
+    options.adding(
         {
             **options.of_run('odometry'),
             '--loops': {
@@ -398,7 +398,7 @@ EXPORT = Command(
     f'a pose are left out and listed in {export.REPORT_FILE}. Prints how far the points are from '
     'their pixels, and how far the interpolation of the format is from the trajectory. The '
     'directory appears when it is complete. Exit code 1: odometry did not start.',
-    options.declared(
+    options.adding(
         {
             **options.BAG,
             'out': {'metavar': 'OUT', 'type': Path, 'help': 'directory to create (tum: the file)'},

@@ -191,7 +191,7 @@ CALIBRATE = Command(
     'axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), calibration.json '
     'and cost_over_readout.png. Exit code 1: a parameter is not observable in this recording and '
     'left out; the report describes the motion to record instead.',
-    options.declared(
+    options.adding(
         {
             **options.BAG,
             'more': {
@@ -286,7 +286,7 @@ CHECK = Command(
     'offset, readout time, bias, units, focal length and lens. Prints a line for each, with a '
     'verdict (ok, unknown, warning, failure) and the suggested fix. Exit code 1: a defect makes '
     'the estimation fail or its poses wrong.',
-    options.declared(
+    options.adding(
         {
             **options.BAG,
             **options.PARAMETERS,
@@ -493,7 +493,7 @@ UNROLL = Command(
     "(the time offset between camera and IMU is then 0), or on the camera's if the parameter "
     'stamp_clock is camera. All other topics are copied bit by bit. Images that the gyro does not '
     'cover are omitted. Exit code 1: no image could be derotated.',
-    options.declared(
+    options.adding(
         {
             **options.BAG,
             'out_bag': {

@@ -30,7 +30,7 @@ HELP = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.declared(
+    options.adding(
         {
             **options.BAG,
             **options.PARAMETERS,

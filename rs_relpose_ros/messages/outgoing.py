@@ -97,7 +97,7 @@ class PairValue(NamedTuple):
     def text(self, value: Any) -> str:
         """The value as in the message."""
         if self.kind == 'real':
-            return number(value)
+            return number_text(value)
         if self.kind == 'findings':
             return findings_text.message_json(value)
         if value is None:
@@ -105,7 +105,7 @@ class PairValue(NamedTuple):
         if self.kind == 'packed':
             return base64.b64encode(value.astype('<f4').tobytes()).decode()
         if self.kind in ('vector', 'reals'):
-            return ' '.join(map(number, value))
+            return ' '.join(map(number_text, value))
         return str(value)
 
     def value(self, text: str) -> Any:
@@ -575,7 +575,7 @@ def published_covariance(covariance: Array) -> Array:
     return (0.5 * (whole + whole.T)).ravel()
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """Shortest text that reads back as the same number; empty for NaN."""
     if isinstance(value, int):
         return str(value)

@@ -37,7 +37,7 @@ from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, 
 from rs_relpose_ros.messages.outgoing import pair_parts, PAIR_TOPICS
 from rs_relpose_ros.messages.streams import check_timelines
 from rs_relpose_ros.offline import tables
-from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
+from rs_relpose_ros.offline.tables import ERRORS, median_or_none, PairRecord, POSES
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, PairStamps
@@ -310,7 +310,7 @@ def _summary(
         'invalid_messages': run.invalid_messages,
         'not_used': run.reasons.most_common(),
         'medians': {
-            metric.name: median([record.metrics[metric.name] for record in answered])
+            metric.name: median_or_none([record.metrics[metric.name] for record in answered])
             for metric in PAIR_METRICS
         },
         'baselines': tables.baselines(answered),
@@ -320,7 +320,7 @@ def _summary(
             'wall_s': run.seconds,
             'frame_rate_hz': taken / seconds if seconds > 0.0 else None,
             'processing_per_frame_ms': 1e3 * seconds / taken if taken else None,
-            'estimate_median_ms': median(
+            'estimate_median_ms': median_or_none(
                 [1e3 * record.pose.diagnostics.duration for record in records]
             ),
         },

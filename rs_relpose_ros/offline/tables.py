@@ -13,7 +13,7 @@ import numpy as np
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import ReasonCounts
-from rs_relpose_ros.messages.outgoing import number, published_covariance, quat_xyzw
+from rs_relpose_ros.messages.outgoing import number_text, published_covariance, quat_xyzw
 from rs_relpose_ros.offline.truth import median_and_p90, PairErrors, TrueTrajectory
 from rs_relpose_ros.output_files import written
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
@@ -65,7 +65,7 @@ def _pose_row(record: PairRecord) -> list[str]:
     Floats are written so that they read back bit-equal.
     """
     pose = record.pose
-    matches = number(record.metrics.get('matches', math.nan))
+    matches = number_text(record.metrics.get('matches', math.nan))
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
     if not pose.rotation_known:
         return [*stamps, *[''] * 13, matches, '', pose.status.value, '', '']
@@ -82,13 +82,13 @@ def _pose_row(record: PairRecord) -> list[str]:
     ]
     return [
         *stamps,
-        *map(number, values),
-        number(record.metrics['inliers']),
+        *map(number_text, values),
+        number_text(record.metrics['inliers']),
         matches,
         pose.diagnostics.model,
         pose.status.value,
-        number(pose.baseline),
-        number(pose.baseline_log_sigma),
+        number_text(pose.baseline),
+        number_text(pose.baseline_log_sigma),
     ]
 
 
@@ -129,11 +129,11 @@ def _error_row(record: PairRecord) -> list[str] | None:
     values = [''] * 4
     if errors is not None:
         known = errors.baseline, errors.rotation, errors.rotation_error, errors.translation_error
-        values = [number(value) for value in known]
+        values = [number_text(value) for value in known]
     return [
         str(record.reference_stamp_ns),
         str(record.stamp_ns),
-        number(record.metrics['interval_s']),
+        number_text(record.metrics['interval_s']),
         *values,
         record.pose.status.value,
     ]
@@ -206,7 +206,7 @@ def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
             known.append(record.pose.baseline_log_sigma)
     return {
         'known': len(known),
-        'log_sigma_median': median(known),
+        'log_sigma_median': median_or_none(known),
         'not_known': reasons.most_common(),
     }
 
@@ -224,11 +224,11 @@ def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | Non
         'rotation_p90_deg': _finite(rotation_p90),
         'translation_median_deg': _finite(translation),
         'translation_p90_deg': _finite(translation_p90),
-        'baseline_median_m': median([error.baseline for error in errors]),
+        'baseline_median_m': median_or_none([error.baseline for error in errors]),
     }
 
 
-def median(values: Sequence[float]) -> float | None:
+def median_or_none(values: Sequence[float]) -> float | None:
     """Median of the finite values; None without any."""
     return _finite(median_and_p90(values)[0])
 

@@ -18,7 +18,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import Role
 from rs_relpose_ros.messages.streams import Timeline
 from rs_relpose_ros.offline.tables import PairRecord, rotation_sigmas, translation_sigmas
-from rs_relpose_ros.report.residuals import Cells, map_of, MatchResiduals, mean_rates, Rates
+from rs_relpose_ros.report.residuals import Cells, map_of, MatchResiduals, Rates, rates_compared
 from rs_relpose_ros.report.run import Inertial, Observation
 
 # Width of a drawing [inch]: with its letters of 9 points it is read on a phone of 370 px.
@@ -306,7 +306,7 @@ def rates_of(observation: Observation) -> Rates | None:
     direction = -1 if sensor.readout_direction in ('up', 'left') else 1
     signed_readout = (sensor.readout_time or 0.0) * direction
     offset_ns = round(NANOSECONDS * (sensor.time_offset + share * signed_readout))
-    return mean_rates(
+    return rates_compared(
         [one.stamp_ns + offset_ns for one in rotations],
         [one.interval for one in rotations],
         np.array([one.by_images for one in rotations]),

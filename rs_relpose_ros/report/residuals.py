@@ -164,7 +164,7 @@ class Rates:
         return np.array(middles), np.array(offsets)
 
 
-def mean_rates(
+def rates_compared(
     stamps_ns: Sequence[int],
     intervals: Sequence[float],
     by_images: Array,
