@@ -85,7 +85,10 @@ def estimate(problem: PairProblem) -> RelativePose:
     Raises InputError for a solver that needs gravity, without it.
     """
     started = time.perf_counter()
-    pose = frames_between.refined(Estimation(problem).run(), problem)
+    has_frames = len(problem.motions) > 2 and problem.knows_rotation
+    pose = frames_between.refined(Estimation(problem, is_start=has_frames).run(), problem)
+    if has_frames and (reason := pose.diagnostics.frames_reason):
+        pose = Estimation(problem).run().diagnosed(frames_reason=reason)
     pose = _certain(pose, problem.config)
     if problem.no_inertial:
         pose = pose.without_baseline(f'baseline not known: {problem.no_inertial}')
@@ -143,8 +146,14 @@ class Estimation:
     sandwich covariance over image regions.
     """
 
-    def __init__(self, pair: PairProblem) -> None:
+    def __init__(self, pair: PairProblem, is_start: bool = False) -> None:
+        """Prepare a pair; `is_start`: all frames will refine the pose and its covariance.
+
+        Then one scale of the velocities is enough. [measured: 291 simulated pairs, the same
+        errors of the poses from all frames as with the mean over four scales]
+        """
         self.config = config = pair.config
+        self._is_start = is_start
         self.mode = _mode(pair)
         self.problem = problem = pair.two_views(self.mode.model.derotated)
         # Usable matches, the best ones first: the sampling order.
@@ -314,6 +323,8 @@ class Estimation:
         expected, scales = velocity.expected_velocities(
             self.problem, self.config.motion, self.interval, self.inertial
         )
+        if self._is_start:
+            scales = scales.nearest(self.priors.velocity.log_scale)
         if self.inertial is not None:
             self.measured = expected
         offset = expected.offset

@@ -551,11 +551,27 @@ def gain_without_gyro(
 
 def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
-    rays = (R @ observations[:, VIEW_2 : VIEW_2 + 3].T).T
-    normals = np.cross(observations[:, VIEW_1 : VIEW_1 + 3], rays).T
-    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
-    _, axes = np.linalg.eigh(normals @ normals.T)
+    _, axes = np.linalg.eigh(_scatter_of_normals(observations, R))
     return np.ascontiguousarray(axes[:, 0])
+
+
+# Least length of the normal of an epipolar plane, as the sine of the parallax. A smaller one lets
+# points at infinity decide by their noise. [chosen: half a pixel at 500 px of focal length]
+_LEAST_PARALLAX = 1e-3
+
+
+@kernel
+def _scatter_of_normals(observations: Array, R: Array) -> Array:
+    """``sum n n^T`` (3, 3) of the unit normals of the epipolar planes for a rotation R."""
+    out = np.zeros((3, 3))
+    for i in range(len(observations)):
+        ray2 = so3.rotated(R, observations[i, VIEW_2 : VIEW_2 + 3])
+        normal = so3.cross(observations[i, VIEW_1 : VIEW_1 + 3], ray2)
+        unit = so3.scale(1.0 / max(so3.norm(normal), _LEAST_PARALLAX), normal)
+        for j in range(3):
+            for k in range(3):
+                out[j, k] += unit[j] * unit[k]
+    return out
 
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------

@@ -7,6 +7,8 @@ between the frames is known, b is the baseline: an unknown of each fit, with a m
 grid as prior.
 """
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 
@@ -50,6 +52,12 @@ class Scales(NamedTuple):
 
     centres: Array  # ``log b`` of each, or the mean of its prior
     log_weights: Array  # logarithms of their prior probabilities, up to a constant
+
+    def nearest(self, log_scale: float) -> Scales:
+        """The scale nearest to `log_scale` alone."""
+        nearest = int(np.argmin(np.abs(self.centres - log_scale)))
+        only = slice(nearest, nearest + 1)
+        return Scales(self.centres[only], self.log_weights[only])
 
 
 class Refined(NamedTuple):
