@@ -6,7 +6,8 @@ loading, which no run with compiled kernels needs. Here the bitcode is parsed wh
 is linked with it, and a symbol is looked up when Numba asks for it: for one of each kernel.
 
 The parts of Numba that this replaces are private, and equal in the versions `jit.TRIED`. Without
-them, or if RS_RELPOSE_PUBLIC_NUMBA is set, Numba loads kernels its own way, with the same results.
+them, in another version, or if RS_RELPOSE_PUBLIC_NUMBA is set, Numba loads kernels its own way,
+with the same results.
 """
 
 import os
@@ -15,13 +16,16 @@ from typing import Any
 from llvmlite.binding import parse_bitcode
 import numba
 
+from rs_relpose_ros.jit import TRIED
+
 
 class LateModule:
     """Attribute of a library: the module that others are linked with, parsed for the first one."""
 
     def __get__(self, library: Any, owner: Any = None) -> Any:
         """The module, or None while there is none."""
-        module = vars(library).get('late_module')
+        # A library that was loaded before the classes changed has it under the name of Numba.
+        module = vars(library).get('late_module', vars(library).get('_shared_module'))
         if isinstance(module, bytes):
             module = vars(library)['late_module'] = parse_bitcode(module)
         return module
@@ -93,7 +97,10 @@ def _has(part: Any, name: str) -> bool:
 
 
 _codegen: Any = getattr(numba.core, 'codegen', None)
+_tried = '.'.join(numba.__version__.split('.')[:2]) in TRIED
 # Whether kernels are loaded this way. [derived: the version of Numba, and the environment]
-LATE = not os.environ.get('RS_RELPOSE_PUBLIC_NUMBA') and load_late(
-    getattr(_codegen, 'JITCodeLibrary', None), getattr(_codegen, 'JitEngine', None)
+LATE = (
+    _tried
+    and not os.environ.get('RS_RELPOSE_PUBLIC_NUMBA')
+    and load_late(getattr(_codegen, 'JITCodeLibrary', None), getattr(_codegen, 'JitEngine', None))
 )

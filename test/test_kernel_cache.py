@@ -220,6 +220,22 @@ def test_bitcode_of_a_kernel_is_parsed_when_another_one_is_linked_with_it(packag
         assert usual == [False, late[1], [False, False], [False, False], [True, False], True]
 
 
+# The same for a kernel that was loaded before loading was changed.
+LOADED_BEFORE = """
+from rs_relpose_ros.inner import inner
+results = [inner(3.0)]
+import rs_relpose_ros.kernel_loading
+print(*results, __import__('further').further(3.0))
+"""
+
+
+def test_a_kernel_loaded_before_is_linked_with_another_one(package):
+    (package / 'further.py').write_text(FURTHER)
+    shutil.copy(ROOT / NAME / 'kernel_loading.py', package / NAME)
+    output('from rs_relpose_ros.inner import inner\ninner(3.0)', cwd=package)  # compiles it
+    assert output(LOADED_BEFORE, cwd=package).split() == ['6.0', '60.0']
+
+
 def test_a_numba_without_the_private_parts_stays_as_it_is():
     class Library:
         _unserialize = classmethod(lambda cls, codegen, state: state)
