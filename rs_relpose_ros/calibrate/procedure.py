@@ -242,7 +242,7 @@ def warm_up_fit() -> None:
     problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
     begin = fit.initial(problem, np.eye(3), 0.0)
     some = OFFLINE.mask('axes', 'readout_time')
-    found = errors.fit(fit.with_bends(problem, begin), begin, some, rounds=1)
+    found = errors.fit(fit.with_bends(problem, begin), begin, some, rounds=2)
     errors.widened(found, in_images=True)
 
 
