@@ -191,6 +191,47 @@ def _gyro_times(factor: float) -> Change:
     )
 
 
+def _gyro_through(matrix: Array) -> Change:
+    """The gyro gives `matrix` (3, 3) times the rates: scales of its axes, and angles between."""
+
+    def changed(sample: ImuSample) -> ImuSample:
+        if sample.angular_velocity is None:
+            return sample
+        x, y, z = matrix @ np.array(sample.angular_velocity)
+        return replace(sample, angular_velocity=(float(x), float(y), float(z)))
+
+    return _received(changed)
+
+
+def _late_from(seconds: float, step: float, drift: float) -> Change:
+    """From `seconds` after the first sample on, stamps are late by `step` [s], and by `drift`."""
+
+    def wrong(right: Configured, rng: np.random.Generator) -> Configured:
+        first_ns: list[int] = []
+
+        def changed(sample: ImuSample) -> ImuSample:
+            first_ns[:] = first_ns or [sample.stamp_ns]
+            since = (sample.stamp_ns - first_ns[0]) * 1e-9 - seconds
+            late = step + drift * since if since > 0.0 else 0.0
+            return replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * late))
+
+        return replace(right, sample=changed)
+
+    return wrong
+
+
+def _coefficient(place: int, change: float) -> Change:
+    """One coefficient of the configured distortion is off."""
+
+    def wrong(right: Configured, rng: np.random.Generator) -> Configured:
+        known = right.intrinsics.distortion
+        changed = [*known, *(0.0,) * (place + 1 - len(known))]
+        changed[place] += change
+        return replace(right, intrinsics=replace(right.intrinsics, distortion=tuple(changed)))
+
+    return wrong
+
+
 def _accel(rotation: Rotation, sign: float) -> Change:
     """Accelerometer with rotated axes, or that measures the acceleration of free fall."""
 
@@ -243,6 +284,8 @@ UPSIDE_DOWN = _reversed_order(columns=True, rows=True)
 FLIPPED = _reversed_order(columns=False, rows=True)
 MIRRORED = _reversed_order(columns=True, rows=False)
 
+# Scales and angles of the axes of a cheap gyro.
+_GYRO_MATRIX = np.array([[1.015, 0.004, 0.0], [0.004, 0.985, -0.004], [0.0, -0.004, 1.01]])
 _HALF_ROTATION = Rotation.from_rotvec([0.0, 0.0, math.pi])
 _CYCLE = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -296,10 +339,24 @@ ROWS: Mapping[str, Row] = {
     ),
     'gyro-0.95': Row(('gyro_scale',), SMALL, _gyro_times(0.95), _error('gyro_scale', 0.05)),
     'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97), _error('focal_length', 0.03)),
+    'gyro-matrix': Row(('gyro_scale', 'gyro_skew', 'axes'), SMALL, _gyro_through(_GYRO_MATRIX)),
+    'k1+0.05': Row(('distortion',), SMALL, _coefficient(0, 0.05)),
+    'k2+0.15': Row(('distortion',), SMALL, _coefficient(1, 0.15)),
+    'k3+0.3': Row(('distortion',), SMALL, _coefficient(4, 0.3)),
+    'offset-step-40ms': Row(('offset_step', 'time_offset'), SMALL, _late_from(4.0, 0.04, 0.0)),
+    'offset-drift-0.2%': Row(
+        ('offset_drift', 'offset_step', 'time_offset'), SMALL, _late_from(0.0, 0.0, 2e-3)
+    ),
+    'accel-0.8': Row(('accel_scale',), SMALL, _accel(Rotation.identity(), 0.8)),
     'squeezed-0.9': Row(('aspect',), SMALL, _squeezed(0.9)),
     'center-36-left': Row(('principal_point',), SMALL, _center(36.0, 0.0)),
     'center-20-top': Row(('principal_point',), SMALL, _center(0.0, 20.0)),
     'mirrored': Row(('image_geometry',), SMALL, _shown(MIRRORED)),
+    'direction-sideways': Row(
+        ('readout_direction',),
+        SMALL,
+        lambda right, rng: right.with_values(readout_direction='right'),
+    ),
     # Reading up instead of down is an error of twice the readout time.
     'direction-reversed': Row(
         ('readout_direction',),
