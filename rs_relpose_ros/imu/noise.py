@@ -31,9 +31,7 @@ def noise_of_samples(values: Array, seconds: Array) -> float:
     A motion hardly changes these at the rate of an IMU. A vibration is no white noise: its
     integral may be smaller.
     """
-    size = float(np.median(np.abs(np.diff(values, n=3, axis=0))))
-    sigma = SIGMA_PER_MEDIAN * size / math.sqrt(_THIRD_DIFFERENCE)
-    return sigma * math.sqrt(float(np.median(np.diff(seconds))))
+    return _density(float(np.median(_third_differences(values))), seconds)
 
 
 def shown_density(values: Array, seconds: Array, configured: float) -> float:
@@ -53,4 +51,14 @@ def shown_density(values: Array, seconds: Array, configured: float) -> float:
 
 
 def _of_noisiest_axis(values: Array, seconds: Array) -> float:
-    return max(noise_of_samples(axis[:, None], seconds) for axis in values.T)
+    return _density(float(np.median(_third_differences(values), axis=0).max()), seconds)
+
+
+def _third_differences(values: Array) -> Array:
+    return np.abs(np.diff(values, n=3, axis=0))
+
+
+def _density(median: float, seconds: Array) -> float:
+    """Density by the median size of the third differences of samples at times (K,)."""
+    sigma = SIGMA_PER_MEDIAN * median / math.sqrt(_THIRD_DIFFERENCE)
+    return sigma * math.sqrt(float(np.median(np.diff(seconds))))
