@@ -99,6 +99,19 @@ def test_pairs_among_many_that_contradict_the_gyro_are_not_trusted(squares, with
     assert not contradictions.too_many
 
 
+def test_pairs_between_many_that_contradict_the_gyro_are_not_trusted():
+    """As of two views in one image: half of the pairs agree with the gyro, by chance."""
+    contradictions = Contradictions()
+    everything = np.ones(30, dtype=bool)
+    for square in [41.0] * 8 + [1.0, 41.0] * 8:
+        contradictions.add(pose_of(everything, square))
+        assert contradictions.too_many or contradictions.counts[1] < 6
+    for number in range(8):
+        assert contradictions.too_many is (number < 6)
+        contradictions.add(pose_of(everything, 1.0))
+    assert not contradictions.too_many
+
+
 def test_rotations_that_differ_as_the_configuration_allows_are_no_contradiction():
     contradictions = Contradictions()
     pose = pose_of(np.ones(30, dtype=bool), 41.0)

@@ -397,8 +397,8 @@ def _contradicting(finding: Finding) -> Text:
     return Text(
         f'images and gyro contradict each other in {evidence.measured["differing"]} of the last '
         f'{evidence.pairs} pairs, and the cause is not known; candidates: stabilisation of lens '
-        'or images, images that were resized or squeezed without their CameraInfo, vibration, a '
-        'moving object, clocks',
+        'or images, images that were resized or squeezed without their CameraInfo, two views side '
+        'by side in one image (stereo), vibration, a moving object, clocks',
         'compare size and focal lengths of the CameraInfo with the images; switch stabilisation '
         'off; run "rs_relpose calibrate"',
     )

@@ -60,6 +60,15 @@ _MOST_REJECTED = 2
 # The same of pairs whose rotation differs from the gyro's by `CONTRADICTS_GYRO`. [measured: none
 # on correct walks and two recordings, 5 with an offset that moves by 8 ms, 7 with squeezed images]
 _MOST_DIFFERENT = 5
+# Difference between the factors of a gyro's axes that is no cause. A smaller one would leave a bad
+# gyro without a name, a larger one would name the scale for two views in one image, which have
+# factors of 0.6 and 1.2. [chosen: another unit is one factor, and MEMS gyros are within 5 %; 0.15
+# to 0.4 would do]
+_LARGEST_SPREAD = 0.3
+# The same of pairs with which it ends. With more, pairs of two views in one image would be
+# published between others; with fewer, a single poor pair would withhold many. [measured: 4 of 8
+# differ where the images of two views show poses that are up to 130 of their sigmas off]
+_ENDS_WITH = 1
 # Pairs that agree with the gyro, before which a pair that differs from it has no pose: no test has
 # excluded yet that all of them will. Fewer would publish the first pairs of a camera that is
 # configured wrong, more would withhold single poor pairs of correct recordings for longer.
@@ -242,7 +251,8 @@ class ConsistencyMonitor:
         self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
         if not gross:
             self._test_without_cause()
-        if self.contradictions.too_many and not self.health.faults:
+        has_cause = bool(gross) or (bool(self.health.faults) and self._is_possible())
+        if not has_cause and (self.contradictions.too_many or self.health.faults):
             unknown = assessment.contradicting(*self.contradictions.counts)
             others = assessment.not_evaluated(set(), unknown.code)
             self.health = Assessment((unknown, *others))
@@ -261,6 +271,10 @@ class ConsistencyMonitor:
         # Residuals differ as rotations do where a parameter deviates within its stated sigma.
         if not self.deviates_as_allowed(configured):
             self.health = self.residuals.added_to(self.health)
+
+    def _is_possible(self) -> bool:
+        """Whether a gyro can have the scale that is found."""
+        return bool(np.ptp(self._deviation()[LIVE.part('gyro_scale')]) <= _LARGEST_SPREAD)
 
     def _add_others(self, stamp_ns: int) -> None:
         """Add the findings that do not depend on the parameters."""
@@ -488,6 +502,7 @@ class Contradictions:
         self._kinds: deque[tuple[bool, bool]] = deque(maxlen=_RECENT)
         self._agreed = 0
         self.is_untested = False  # whether the last pair differs, and few have agreed before it
+        self.too_many = False  # whether so many contradict it that no other one is to be trusted
 
     def add(self, pose: RelativePose, *, is_allowed: bool = False) -> None:
         """Add a pair with the pose of its estimate, which may be rejected.
@@ -499,11 +514,17 @@ class Contradictions:
         self._kinds.append((is_rejected, is_rejected or differs))
         self.is_untested = differs and self._agreed < _TESTED
         self._agreed += not (is_rejected or differs)
+        rejected = sum(is_rejected for is_rejected, _ in self._kinds)
+        differing, count = self.counts
+        if rejected > _MOST_REJECTED or differing > _MOST_DIFFERENT:
+            self.too_many, self._agreed = True, 0
+        elif count == _RECENT and differing <= _ENDS_WITH:
+            self.too_many = False
 
     def clear(self) -> None:
         """Forget the pairs."""
         self._kinds.clear()
-        self._agreed = 0
+        self._agreed, self.too_many = 0, False
 
     def widened(self, pose: RelativePose) -> RelativePose:
         """The pose with the covariance of a noise that the pairs so far have tested.
@@ -519,12 +540,6 @@ class Contradictions:
     def counts(self) -> tuple[int, int]:
         """Number of pairs that contradict the gyro, and of all of the last ones."""
         return sum(differs for _, differs in self._kinds), len(self._kinds)
-
-    @property
-    def too_many(self) -> bool:
-        """Whether so many contradict it that no other one is to be trusted."""
-        rejected = sum(is_rejected for is_rejected, _ in self._kinds)
-        return rejected > _MOST_REJECTED or self.counts[0] > _MOST_DIFFERENT
 
 
 class Agreement:
