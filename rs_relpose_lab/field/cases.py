@@ -377,7 +377,8 @@ CASES: tuple[Case, ...] = (
         'columns are in reverse order',
         _D.mirrored,
         r'mirror|flip',
-        ('image_geometry',),
+        # Rotations alone fit axes that are half a turn off as well: both are candidates.
+        ('image_geometry', 'axes'),
     ),
     Case(
         'G6',
