@@ -169,19 +169,18 @@ def test_covariance_by_groups_is_that_of_correlated_errors():
     groups, found = 30, []
     J = rng.normal(size=(groups, 4, 2))
     curvatures = np.einsum('gki,gkj->gij', J, J)
-    nothing = np.zeros((2, 2))
-    inverse = np.linalg.inv(curvatures.sum(axis=0))
+    hessian = curvatures.sum(axis=0)
+    inverse = np.linalg.inv(hessian)
     true = sum(inverse @ j.sum(axis=0)[:, None] @ j.sum(axis=0)[None] @ inverse for j in J)
     for _ in range(400):
         r = np.repeat(rng.normal(size=groups), 4).reshape(groups, 4)
         r = r - J @ (inverse @ np.einsum('gki,gk->i', J, r))  # at the optimum
         scores = np.einsum('gki,gk->gi', J, r)
-        found.append(
-            [
-                np.diag(least_squares.grouped_covariance(scores, curvatures, nothing, share))
-                for share in (0.0, least_squares.CR2, least_squares.JACKKNIFE)
-            ]
-        )
+        of_shares = []
+        for share in (0.0, least_squares.CR2, least_squares.JACKKNIFE):
+            adjusted = least_squares.adjusted_scores(scores, curvatures, hessian, share)
+            of_shares.append(np.diag(inverse @ adjusted.T @ adjusted @ inverse))
+        found.append(of_shares)
     plain, cr2, jackknife = np.mean(found, axis=0) / np.diag(true)
     assert (plain < cr2).all() and (cr2 < jackknife).all()
     np.testing.assert_allclose(cr2, 1.0, atol=0.08)

@@ -54,7 +54,6 @@ class Case:
     base: str = 'walk'
     # Whether the data allow poses: at least 80 % of the undisturbed number are wanted then.
     solvable: bool = False
-    withheld_is_right: bool = True
     commands: tuple[str, ...] = ('check', 'calibrate', 'replay', 'odometry')
 
 

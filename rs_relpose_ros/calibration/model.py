@@ -81,8 +81,6 @@ EXPOSURE = OFFLINE.index('exposure_square')
 LENS = deviations.LENS
 # Number of the parameters.
 GLOBAL = OFFLINE.size
-# First coefficient of the distortion.
-RADIAL = DISTORTION.start
 # Places of the unknowns of a pair, after the parameters.
 _UNKNOWNS = first_indices(parameters=GLOBAL, direction=2, bend=3, turn=3)
 # Step of the direction in its tangent plane.

@@ -129,7 +129,6 @@ class _Linearised(NamedTuple):
     prior: priors.Priors  # of the state
     theta: Array  # (3,)
     gyro: Array  # (3, K) rotation of R_gyro, on its left
-    gyro_by_image: Array  # (3, 9) the same
 
 
 class _Normal(NamedTuple):
@@ -313,7 +312,6 @@ def _linearised(pair: PairData, problem: TwoViewProblem, at: Array, basis: Array
         prior,
         so3.log_so3(np.ascontiguousarray(state.R @ rotation.T)),
         gyro @ basis,
-        gyro @ of_images,
     )
 
 

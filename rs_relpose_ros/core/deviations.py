@@ -82,8 +82,6 @@ N_DEVIATIONS = sum(entry.size for entry in ENTRIES)
 # Places of the entries of `geometry.lens` in the whole vector.
 LENS = slice(PARTS['focal_log'].start, PARTS['principal_point'].stop)
 
-# Basis (3, 1) of one value that is common to the three components of an entry.
-COMMON = np.ones((3, 1))
 # Basis (3, 1) of the first of the three components alone.
 FIRST = np.eye(3)[:, :1]
 

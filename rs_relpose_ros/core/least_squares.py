@@ -269,17 +269,3 @@ def adjusted_scores(scores: Array, curvatures: Array, hessian: Array, deleted: f
             for i in range(n):
                 adjusted[g, i] = (1.0 - deleted) * scores[g, i] - deleted * without[i]
     return adjusted
-
-
-@kernel
-def grouped_covariance(scores: Array, curvatures: Array, prior: Array, deleted: float) -> Array:
-    """Covariance (n, n) of an optimum by the scatter of the groups' gradients.
-
-    `prior` (n, n) is the information of the priors, whose errors count as known. The other
-    arguments are those of `adjusted_scores`. Errors may be correlated within a group in any way;
-    those of different groups are independent.
-    """
-    hessian = prior + curvatures.sum(axis=0)
-    adjusted = adjusted_scores(scores, curvatures, hessian, deleted)
-    covariance = inverse(hessian)
-    return covariance @ (adjusted.T @ adjusted + prior) @ covariance
