@@ -673,6 +673,27 @@ def test_clocks_that_are_far_apart_are_found_by_the_rotations(offset):
             assert not found
 
 
+@pytest.mark.parametrize('turned', [False, True])
+def test_neither_axes_nor_clocks_are_named_where_both_explain_the_rotations(turned):
+    """Two axes swing once a stride and one twice: half a stride later two have changed sign."""
+    rng, stride = np.random.default_rng(12), 0.9
+    turn, offset = (np.diag([-1.0, 1.0, -1.0]), 0.0) if turned else (np.eye(3), 0.5 * stride)
+
+    def angles(at):
+        phase = 2.0 * math.pi * at / stride
+        swing = np.array([math.sin(phase), math.cos(2.0 * phase), math.sin(phase + 0.7)])
+        return 0.08 * swing + 0.02 * math.sin(1.7 * at)
+
+    sums = RotationSums()
+    for k, end in enumerate(np.arange(0.0, 8.0, 0.1)):
+        by_images = angles(end) - angles(end - 0.1) + 4e-3 * rng.normal(size=3)
+        by_gyro = turn @ (angles(end - offset) - angles(end - offset - 0.1))
+        sums.add(100 * MS * k, 0.1, by_images, by_gyro)
+    compared = sums.compared()
+    assert max(compared.left_at_best, compared.left_at_offset) < 0.1 < compared.left_as_configured
+    assert not faults_of(sums)
+
+
 def test_a_steady_translation_is_no_rotation():
     """It is similar to a constant rate of the images, without information on the axes."""
     rng, sums = np.random.default_rng(5), RotationSums()

@@ -625,6 +625,10 @@ def gross_errors(
         )
     if rotations.offset is not None:
         return (_other_time(rotations.offset, configured),)
+    if rotations.is_at_another_time:
+        active = _active_offset(configured)
+        why = Why.AT_OTHER_TIME
+        return (Finding(Code.TIME_OFFSET, FindingState.WRONG, why, (active,), unit='s'),)
     found = tuple(_rotation_errors(rotations, configured))
     # Any error may leave images and gyro independent for a while, if frames are lost.
     certain = found and (not before or found[0].why is not Why.INDEPENDENT)
@@ -633,8 +637,7 @@ def gross_errors(
 
 def _other_time(offset: float, configured: Configured) -> Finding:
     """That images and gyro rotate alike at another offset, far from the active one."""
-    applied = float(configured.active[LIVE.index('time_offset')])
-    active = configured.sensor.time_offset + applied
+    active = _active_offset(configured)
     return Finding(
         Code.TIME_OFFSET,
         FindingState.WRONG,
@@ -644,6 +647,11 @@ def _other_time(offset: float, configured: Configured) -> Finding:
         unit='s',
         settings={'time_offset': round(active + offset, 2)},
     )
+
+
+def _active_offset(configured: Configured) -> float:
+    """Time offset [s] of the parameter with what is applied to it."""
+    return configured.sensor.time_offset + float(configured.active[LIVE.index('time_offset')])
 
 
 def _rotation_errors(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:

@@ -259,7 +259,13 @@ def _clocks_apart(finding: Finding) -> Text:
 
 
 def _at_other_time(finding: Finding) -> Text:
-    assert finding.estimate is not None and finding.active is not None
+    assert finding.active is not None
+    if finding.estimate is None:
+        return Text(
+            'images and gyro rotate alike at another time offset, one of several yet, active '
+            f'{finding.active:.2f} s',
+            'find it with "rs_relpose calibrate", or turn the camera in several ways',
+        )
     return Text(
         f'images and gyro rotate alike at a time offset of about {finding.estimate:.2f} s and no '
         f'other one, active {finding.active:.2f} s',

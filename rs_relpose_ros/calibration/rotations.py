@@ -55,6 +55,9 @@ _FINE: Array = np.linspace(-0.03, 0.03, 7)
 # Sum of the gyro's angles [rad] from which offsets are tried: less takes the time for what noise
 # and translation make. [derived: that from which independent rotations are reported]
 _ENOUGH_FOR_OFFSET = 2.0
+# Sum of the gyro's angles [rad] from which images and gyro have to be related. Less is what
+# translation makes of the images' rotation. [chosen: half of what an offset needs]
+_ENOUGH_TO_RELATE = 1.0
 # Offsets within this distance [s] of the best one are the same explanation. [chosen: half a period
 # of the steps of a walk is 0.25 s; 0.08 to 0.2 s would do]
 _SAME_OFFSET = 0.12
@@ -63,6 +66,10 @@ _LEAST_OFFSET = 0.05
 # Share of the images' rotation that the right offset leaves at most. [measured: 0.08 to 0.28 with
 # clocks that are off by 0.5 s]
 _LEFT_AT_OFFSET = 0.4
+# Share that the right rotation of interchanged axes leaves at most. A larger one takes clocks that
+# are apart for axes. [measured: .01 to .22 on two walks with axes turned by 90 and 180 deg, .4 to
+# .9 with clocks that are .3 to .6 s apart]
+_LEFT_IF_TURNED = 0.3
 # Rotations that an offset has to compare. Fewer agree by chance. [chosen: 2 to 3 s]
 _FEWEST_AT_OFFSET = 25
 
@@ -102,25 +109,55 @@ class RotationComparison:
     scale: float  # images over gyro, after `rotation`
     by_gyro: float  # [rad] sum of the angles
     count: int
+    # At the best of other time offsets, no rotation; infinite if too little turned to try them.
+    left_at_offset: float
     # Time offset [s], if the rotations agree there, and at no other one, without any rotation.
     offset: float | None
 
     @property
+    def is_at_another_time(self) -> bool:
+        """Whether they agree at another offset alone, for certain better than as configured.
+
+        Which one of several may be open: a walk repeats itself with each step.
+        """
+        if self.by_gyro < _ENOUGH_FOR_OFFSET or not self._agrees_later:
+            return False
+        # Twice the certainty of other causes: the best of many offsets.
+        is_better = self._certain(self.left_of_all, self.left_at_offset, 2.0 * _LOG_LIKELIHOOD)
+        return is_better and self.left_at_best > _LEFT_IF_TURNED
+
+    @property
     def is_turned(self) -> bool:
-        """Whether axes are interchanged: `rotation` is large, and better for certain."""
-        return self.angle > _LARGE_ANGLE and self._certain(
-            self.left_as_configured, self.left_at_best
-        )
+        """Whether axes are interchanged: `rotation` is large, and better for certain.
+
+        Half a step later a walk turns as if axes were interchanged.
+        """
+        if self._agrees_later or self.left_at_best > _LEFT_IF_TURNED:
+            return False
+        is_better = self._certain(self.left_as_configured, self.left_at_best)
+        return self.angle > _LARGE_ANGLE and is_better
+
+    @property
+    def is_unrelated(self) -> bool:
+        """Whether the gyro explains so little that no small error of a parameter is the cause."""
+        is_known = self.count >= _FEWEST_AT_OFFSET and self.by_gyro > _ENOUGH_TO_RELATE
+        return is_known and self.left_as_configured > _LEFT_AT_OFFSET
 
     @property
     def is_left_handed(self) -> bool:
         """Whether a reflection fits for certain better than any rotation, about three axes."""
-        return self._certain(self.left_at_best, self.left_mirrored)
+        is_better = self._certain(self.left_at_best, self.left_mirrored)
+        return is_better and not self._agrees_later
 
-    def _certain(self, left: float, left_instead: float) -> bool:
+    @property
+    def _agrees_later(self) -> bool:
+        """Whether another offset explains the rotations as they are."""
+        return self.left_at_offset < _LEFT_AT_OFFSET
+
+    def _certain(self, left: float, left_instead: float, needed: float = _LOG_LIKELIHOOD) -> bool:
         """Whether the second hypothesis is better, by the likelihoods of three components."""
         ratio = max(left, 1e-9) / max(left_instead, 1e-9)
-        return 1.5 * self.count * math.log(ratio) > _LOG_LIKELIHOOD
+        return 1.5 * self.count * math.log(ratio) > needed
 
     @property
     def angle(self) -> float:
@@ -148,9 +185,11 @@ class RotationSums(LastSeconds):
             return None
         left_of_all = _left(float((theta * phi).sum()), theta, phi)
         ends = (stamps_ns - stamps_ns[0]) / NANOSECONDS
-        offset = None
-        if left_of_all > _LEFT_AT_OFFSET and by_gyro > _ENOUGH_FOR_OFFSET:
-            offset = _offset_of(ends, intervals, theta, phi)
+        offset, left_at_offset = None, math.inf
+        if left_of_all > _LEFT_AT_OFFSET:
+            offset, left_at_offset = _offset_of(ends, intervals, theta, phi)
+        if by_gyro < _ENOUGH_FOR_OFFSET:
+            offset = None
         theta = _without_rate(theta, intervals)
         phi = _without_rate(phi, intervals)
         M = theta.T @ phi
@@ -170,6 +209,7 @@ class RotationSums(LastSeconds):
             trace / max(float((phi**2).sum()), _NO_ROTATION),
             by_gyro,
             len(self),
+            left_at_offset,
             offset,
         )
 
@@ -180,9 +220,12 @@ def _without_rate(rotations: Array, intervals: Array) -> Array:
     return np.asarray(rotations - np.outer(intervals, rate))
 
 
-def _offset_of(ends: Array, intervals: Array, theta: Array, phi: Array) -> float | None:
+def _offset_of(
+    ends: Array, intervals: Array, theta: Array, phi: Array
+) -> tuple[float | None, float]:
     """Time offset [s] at which rotations of images and gyro (N, 3) agree; None unless certain.
 
+    Returns the share of the images' rotation, too, that the gyro leaves at the best offset.
     `ends` (N,) [s], in the order of time: the gyro between two rotations is interpolated.
     """
     times = np.concatenate([[ends[0] - intervals[0]], ends])
@@ -214,11 +257,11 @@ def _offset_of(ends: Array, intervals: Array, theta: Array, phi: Array) -> float
     # Twice the certainty of other causes: the best of many offsets.
     needed = 2.0 * _LOG_LIKELIHOOD / (1.5 * max(counts[best], 1))
     if least > _LEFT_AT_OFFSET or abs(best_offset) < _LEAST_OFFSET:
-        return None
+        return None, least
     if rival < math.exp(needed) * max(least, 1e-9):
-        return None
+        return None, least
     near = [float(offset) for offset in best_offset + _FINE]
-    return min(near, key=lambda offset: left_at(offset)[0])
+    return min(near, key=lambda offset: left_at(offset)[0]), least
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:

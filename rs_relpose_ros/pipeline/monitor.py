@@ -244,14 +244,16 @@ class ConsistencyMonitor:
             return
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
         ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
-        self._gross = assessment.gross_errors(
-            self.rotations.compared(), ahead, configured, self._gross
-        )
+        compared = self.rotations.compared()
+        self._gross = assessment.gross_errors(compared, ahead, configured, self._gross)
         gross = self._gross or self._directions.findings(configured.camera)
         self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
         if not gross:
             self._test_without_cause()
-        has_cause = bool(gross) or (bool(self.health.faults) and self._is_possible())
+        # Rotations that have nothing in common are no small error of a parameter.
+        is_related = compared is None or not compared.is_unrelated
+        is_possible = bool(self.health.faults) and is_related and self._is_possible()
+        has_cause = bool(gross) or is_possible
         if not has_cause and (self.contradictions.too_many or self.health.faults):
             unknown = assessment.contradicting(*self.contradictions.counts)
             others = assessment.not_evaluated(set(), unknown.code)
