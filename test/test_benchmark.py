@@ -508,7 +508,10 @@ def test_information_of_a_rotation(quantity, axis, rates, low, high):
 
 @pytest.mark.recordings
 def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
-    """Also with 18 px too much of the focal length: one pair has too little parallax."""
+    """Also with 18 px too much of the focal length.
+
+    One pair has too little parallax, and one differs from the gyro before eight have agreed.
+    """
     name = 'android_phone_rs'
     bag = converted(name, 'android')
     right = (ROOT / 'rs_relpose_lab' / 'recordings' / f'{name}.yaml').read_text()
@@ -517,7 +520,7 @@ def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
     bag.with_suffix('.yaml').write_text(right.replace('482.0', '500.0') + lens)
     recording = trust_runs.recording_at(bag)
     pairs = [pair for pair, _ in trust_runs.run(recording, recording.configured, 4.5)]
-    assert [pair.stamp_ns // 10**8 % 10**4 for pair in pairs if not pair.pose] == [4353]
+    assert [pair.stamp_ns // 10**8 % 10**4 for pair in pairs if not pair.pose] == [4353, 4369]
     assert not [pair.health.faults for pair in pairs if pair.health.faults]
 
 

@@ -260,6 +260,7 @@ def monitored(pairs, image_findings=()):
         np.zeros(3),
         configured_sigmas(PARAMETERS, 0.0, CAMERA),
         np.zeros(LIVE.size),
+        PARAMETERS.imu.gyro_noise_density,
     )
     pose = RelativePose(Status.NO_CONSENSUS)
     for one in pairs:

@@ -31,7 +31,12 @@ from rs_relpose_ros.calibration.rotations import AccelerationSums, RotationSums
 from rs_relpose_ros.calibration.second_motion import SecondMotions
 from rs_relpose_ros.config.settings import ImuConfig, SensorConfig
 from rs_relpose_ros.core.deviations import LIVE
-from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
+from rs_relpose_ros.estimator.result import (
+    Diagnostics,
+    GYRO_CONTRADICTION,
+    RelativePose,
+    Status,
+)
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
@@ -80,6 +85,24 @@ _TESTED = 8
 _STUDENT = 2.46
 # Degrees of freedom of a pair's rotation against the gyro's. [derived: a rotation has three]
 _OF_ROTATION = 3.0
+# Reason for a pair whose images contradict the gyro. [derived: text for people]
+_STEP_SOUGHT = f'{GYRO_CONTRADICTION}, other than before: a step of a clock is looked for'
+# Reason for a pair among others that contradict the gyro. [derived: text for people]
+_CONTRADICTING = 'the images of most of the last pairs contradict the gyro, whatever the cause'
+# Reason for a pair that contradicts the gyro before others agree. [derived: text for people]
+_UNTESTED = (
+    'the images contradict the gyro, and few pairs before agree with it: the configuration is '
+    'being tested'
+)
+# Reason for a pair of two views alone where each frame has errors. [derived: text for people]
+_BY_TWO_VIEWS = (
+    'the frames of the pair do not fit each other, as stamps jitter or the gyro has noise '
+    '(see health)'
+)
+# Reason for a pair that may follow an object. [derived: text for people]
+_TWO_MOTIONS = (
+    'the matches have two motions, and the images contradict the gyro: an object moves in the view'
+)
 # Largest chi-square of a pair per degree of freedom that counts. Without a bound a single pair of
 # a moving object would widen the pairs of many seconds.
 # [chosen: far above the 99.9 % quantile of two degrees of freedom, 6.9]
@@ -182,6 +205,45 @@ class ConsistencyMonitor:
             if shift.any() and pose
             else assessed
         )
+
+    def widened(
+        self,
+        stamps_ns: tuple[int, int],
+        pose: RelativePose,
+        assessed: RelativePose,
+        imu: ImuConfig,
+    ) -> RelativePose:
+        """The pose with all that its own pair does not show; `assessed`: of `add_pair`."""
+        pose = self.agreement.enlarged(*stamps_ns, pose, assessed)
+        return with_scale_doubt(self.contradictions.widened(pose), imu)
+
+    def without_doubtful(
+        self,
+        pose: RelativePose,
+        *,
+        has_rate_doubt: bool,
+        may_be_step: bool,
+        follows_object: bool,
+    ) -> RelativePose:
+        """The pose, unless it is wrong, or no test says that its covariance holds.
+
+        `has_rate_doubt`: whether the gyro has more noise than configured. `may_be_step` and
+        `follows_object`: what `clock_steps` and `second_motions` say of the pair.
+        """
+        pose = suppressed(pose, self.health)
+        # Two views have no test, and no part of the covariance, for errors of single frames.
+        is_of_frames = math.isfinite(pose.diagnostics.gyro_square)
+        has_errors = has_rate_doubt or self.jitter > 0.0
+        for is_so, reason in (
+            (self.contradictions.is_untested, _UNTESTED),
+            (self.contradictions.too_many, _CONTRADICTING),
+            (has_errors and not is_of_frames, _BY_TWO_VIEWS),
+            (may_be_step, _STEP_SOUGHT),
+            (follows_object, _TWO_MOTIONS),
+        ):
+            if is_so:
+                pose = withheld(pose, reason)
+        return pose
 
     def learn(self) -> posterior.PairInformation | None:
         """Estimate the calibration from the last pair as well: its pose does not wait for it.

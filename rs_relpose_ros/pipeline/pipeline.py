@@ -23,7 +23,7 @@ from rs_relpose_ros.core.deviations import LIVE
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import estimate, evidence_for_inertial
 from rs_relpose_ros.estimator.pair_problem import PairProblem
-from rs_relpose_ros.estimator.result import GYRO_CONTRADICTION, RelativePose, Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.matches import Ids, Matches
@@ -35,10 +35,7 @@ from rs_relpose_ros.pipeline import pair
 from rs_relpose_ros.pipeline.monitor import (
     Applied,
     ConsistencyMonitor,
-    suppressed,
     Tracked,
-    with_scale_doubt,
-    withheld,
 )
 from rs_relpose_ros.pipeline.pair import (
     Frame,
@@ -70,24 +67,6 @@ _JITTER_PAIRS = 60
 # Least time between two published pairs with too few matches [s]: in the dark each frame creates
 # one. [chosen: two a second are enough for a display]
 _UNMATCHED_PERIOD = 0.5
-# Reason for a pair whose images contradict the gyro. [derived: text for people]
-_STEP_SOUGHT = f'{GYRO_CONTRADICTION}, other than before: a step of a clock is looked for'
-# Reason for a pair among others that contradict the gyro. [derived: text for people]
-_CONTRADICTING = 'the images of most of the last pairs contradict the gyro, whatever the cause'
-# Reason for a pair that contradicts the gyro before others agree. [derived: text for people]
-_UNTESTED = (
-    'the images contradict the gyro, and few pairs before agree with it: the configuration is '
-    'being tested'
-)
-# Reason for a pair of two views alone where each frame has errors. [derived: text for people]
-_BY_TWO_VIEWS = (
-    'the frames of the pair do not fit each other, as stamps jitter or the gyro has noise '
-    '(see health)'
-)
-# Reason for a pair that may follow an object. [derived: text for people]
-_TWO_MOTIONS = (
-    'the matches have two motions, and the images contradict the gyro: an object moves in the view'
-)
 # Reason for a pair without the accelerometer. [derived: text for people]
 _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
@@ -368,11 +347,7 @@ class Pipeline(Processor[PairResult]):
         since = history.since
         assert since is not None
         matches = self._tracker.refined_matches()
-        scatter = stamp_scatter(self._stamps_ns)
-        self._jitters.append(scatter.sigma if scatter.is_jitter else 0.0)
-        monitor.jitter = max(self._jitters)
-        sigma = max(scatter.sigma, monitor.jitter)
-        monitor.stamp_sigma = math.hypot(sigma, frame.imu_doubt.varying)
+        self._note_scatter(frame.imu_doubt.varying)
         problem = history.problem(
             frame.stamp_ns,
             matches,
@@ -381,7 +356,7 @@ class Pipeline(Processor[PairResult]):
             stamp_sigma=monitor.stamp_sigma,
         )
         monitor.acceleration.note_length(*_length_at_rest(frame.imu, parameters.imu))
-        pose = with_scale_doubt(self._estimated(problem, frame.stamp_ns), parameters.imu)
+        pose = self._estimated(problem, frame.stamp_ns)
         # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
         fitted = pose.diagnostics.rejected or pose
         known = fitted.rotation_known
@@ -402,37 +377,35 @@ class Pipeline(Processor[PairResult]):
             monitor.contradictions.add(pose, is_allowed=is_allowed)
         assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
         if fitted is pose:
-            pose = monitor.agreement.enlarged(*stamps_ns, pose, assessed)
-            pose = monitor.contradictions.widened(pose)
-        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
-        sums_of = _residual_sums(frame, rays, pose, sensor)
-        self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured, sums_of))
+            pose = monitor.widened(stamps_ns, pose, assessed, parameters.imu)
+        published = pose
         if parameters.pair.withhold_when_wrong:
-            pose = self._without_doubtful(pose, problem)
-            if doubtful:
-                pose = withheld(pose, _STEP_SOUGHT)
-            if follows_object:
-                pose = withheld(pose, _TWO_MOTIONS)
+            published = monitor.without_doubtful(
+                pose,
+                has_rate_doubt=problem.rate_doubt > 0.0,
+                may_be_step=doubtful,
+                follows_object=follows_object,
+            )
+        rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
+        intrinsics = frame.intrinsics
+        size = intrinsics.image_width, intrinsics.image_height
+        view = View(*size, sensor.camera.readout_axis)
+        sums_of = partial(PairSums.of, frame.stamp_ns, rays, pose, intrinsics.fx, view)
+        self._lesson = Lesson(partial(self._learn, frame.stamp_ns, configured, sums_of))
         return replace(
-            history.result(frame, rays, pose, sensor, parameters),
+            history.result(frame, rays, published, sensor, parameters),
             health=monitor.health,
             lesson=self._lesson,
             image2=frame.image if self._keep_images else None,
         )
 
-    def _without_doubtful(self, pose: RelativePose, problem: PairProblem) -> RelativePose:
-        """The pose, unless it is wrong, or no test says that its covariance holds."""
+    def _note_scatter(self, of_imu: float) -> None:
+        """Note the scatter of the last stamps for the pair; `of_imu` [s]: that of the gyro's."""
         monitor = self._monitor
-        pose = suppressed(pose, monitor.health)
-        if monitor.contradictions.is_untested:
-            pose = withheld(pose, _UNTESTED)
-        if monitor.contradictions.too_many:
-            pose = withheld(pose, _CONTRADICTING)
-        # Two views have no test, and no part of the covariance, for errors of single frames.
-        has_errors = problem.rate_doubt > 0.0 or monitor.jitter > 0.0
-        if has_errors and not math.isfinite(pose.diagnostics.gyro_square):
-            pose = withheld(pose, _BY_TWO_VIEWS)
-        return pose
+        scatter = stamp_scatter(self._stamps_ns)
+        self._jitters.append(scatter.sigma if scatter.is_jitter else 0.0)
+        monitor.jitter = max(self._jitters)
+        monitor.stamp_sigma = math.hypot(max(scatter.sigma, monitor.jitter), of_imu)
 
     def _learn(
         self,
@@ -529,15 +502,6 @@ class Pipeline(Processor[PairResult]):
             if used and not acceleration.uses(evidence):
                 pose = estimate(problem.without_inertial(_CONTRADICTED))
         return pose
-
-
-def _residual_sums(
-    frame: Frame[Any], rays: Matches, pose: RelativePose, sensor: Sensor
-) -> Callable[[Array | None], PairSums | None]:
-    """The sums of a pair's residuals, made when the rotation against the gyro is known."""
-    size = frame.intrinsics.image_width, frame.intrinsics.image_height
-    view = View(*size, sensor.camera.readout_axis)
-    return partial(PairSums.of, frame.stamp_ns, rays, pose, frame.intrinsics.fx, view)
 
 
 def _length_at_rest(imu: FrameImu, config: ImuConfig) -> tuple[float, float]:
