@@ -16,6 +16,7 @@ from scipy.stats import norm, t
 from rs_relpose_lab.experiments import calibration as benchmark
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
+from rs_relpose_ros.calibrate import procedure
 from rs_relpose_ros.calibrate.procedure import (
     calibrate,
     calibrate_together,
@@ -888,6 +889,18 @@ def test_exposure_is_found():
     assert sigma[EXPOSURE] < 0.15 * 0.04**2
     assert abs(found[EXPOSURE] - 0.04**2) < 4.0 * sigma[EXPOSURE]
     assert abs(found[READOUT] - recorded().truth.readout_time) < 4.0 * sigma[READOUT]
+
+
+def test_exposure_is_not_given_where_it_would_average_the_noise():
+    """White noise of the gyro of 0.06 rad/s at 200 Hz; the images have no exposure."""
+    source, rng = recorded(), np.random.default_rng(4)
+    rates = source.gyro.rates + 0.06 * rng.normal(size=source.gyro.rates.shape)
+    gyro = GyroSeries(source.gyro.stamps_ns, rates)
+    data = observations.Observations.of(source.tracks, gyro, camera_of(source.truth))
+    final, _ = fitted(free_of(), gyro=gyro)
+    exposure = procedure._exposure(data, final, 1e-5)
+    assert not exposure.observable and 'noise' in exposure.remark
+    assert exposure.value <= exposure.sigma == data.interval
 
 
 @pytest.mark.parametrize('given', [{}, {'exposure_time': 0.03}], ids=['unknown', 'given'])

@@ -493,6 +493,17 @@ def test_a_certain_deviation_counts_though_no_pose_suffers(state, estimated, exp
     assert bool(further) is (raised or expected == 'failure')
 
 
+@pytest.mark.parametrize(
+    ('estimated', 'state'), [((404.0, 404.4), FindingState.OK), ((400.5, 404.4), W)]
+)
+def test_a_longer_focal_length_is_no_squeezed_image(estimated, state):
+    """Both values are five sigmas off, which says nothing of their ratio."""
+    found = Finding(
+        Code.ASPECT, FindingState.OK, Why.CONSISTENT, (400.0, 400.0), estimated, 0.8, 'px', 1
+    )
+    assert next(quantity_findings(Assessment((found,)), '')).state is state
+
+
 def test_a_deviation_that_does_no_harm_is_none_beside_one_that_does():
     harmless = Finding(
         Code.READOUT_TIME, FindingState.OK, Why.CONSISTENT, (0.03,), (0.0368,), 1e-3, 's'

@@ -49,6 +49,7 @@ from rs_relpose_ros.geometry.lens import DISTORTION_MODELS, N_LENS
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.imu.integration import integral, interpolated
 from rs_relpose_ros.messages.burst_times import SampleTimes
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.streams import burst_warning
@@ -760,6 +761,27 @@ def _displacement(
     return Estimate(float(by_coefficients @ coefficients), sigma, True)
 
 
+def _changed_by_an_interval(data: Observations) -> float:
+    """Rms change [rad/s] of the gyro's rates by an exposure of an interval.
+
+    Means over one and two intervals differ by three times that, to second order in the exposure,
+    and have little of the noise of single samples.
+    """
+    angles = integral(data.gyro_times, data.gyro_rates)
+    inside = data.gyro_times[
+        (data.gyro_times > data.gyro_times[0] + data.interval)
+        & (data.gyro_times < data.gyro_times[-1] - data.interval)
+    ]
+    means = []
+    for width in (data.interval, 2.0 * data.interval):
+        ends = [
+            interpolated(inside + half, data.gyro_times, angles)
+            for half in (-0.5 * width, 0.5 * width)
+        ]
+        means.append((ends[1] - ends[0]) / width)
+    return math.sqrt(float(np.mean((means[1] - means[0]) ** 2))) / 3.0
+
+
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:
     """Exposure at the median interval [s]."""
     assumed = float(np.median(data.exposure.assumed))
@@ -767,6 +789,11 @@ def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estima
     value = min(math.sqrt(max(square, 0.0)), data.interval)
     # Also of a square near zero, where the root has no derivative.
     sigma = math.sqrt(value**2 + square_sigma) - value
+    noise = data.gyro_density / math.sqrt(data.interval)
+    if noise > _changed_by_an_interval(data):
+        # An exposure averages the noise, too: rows fit the images better with it.
+        reason = 'the gyro has more noise than an exposure of an interval would change its rates'
+        return Estimate(value, data.interval, False, reason)
     return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 

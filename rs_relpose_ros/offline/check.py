@@ -914,7 +914,7 @@ def _state(finding: Finding) -> FindingState:
         finding.active is None
         or finding.estimate is None
         or finding.sigma is None
-        or abs(finding.estimate - finding.active) < _CERTAIN * finding.sigma
+        or _distance(finding) < _CERTAIN * finding.sigma
     ):
         return finding.state
     quantity = BY_CODE.get(Code.READOUT_TIME if finding.code in _READOUT else finding.code)
@@ -923,6 +923,16 @@ def _state(finding: Finding) -> FindingState:
     ):
         return WRONG
     return SUSPECT
+
+
+def _distance(finding: Finding) -> float:
+    """Of the estimated value from the active one; of the aspect, without what fx and fy share."""
+    assert finding.estimate is not None and finding.active is not None
+    if finding.code is not Code.ASPECT:
+        return abs(finding.estimate - finding.active)
+    fx, fy = finding.estimated
+    active_fx, active_fy = finding.configured
+    return abs(fy - fx * active_fy / active_fx)
 
 
 def _not_configured(code: Code, completion: Completion, scan: Scan) -> Line:
