@@ -113,6 +113,7 @@ class NoisePosterior:
         self._prior = _prior(_ACCEL_ERROR_SIGMA, _GYRO_ERROR_HALF)
         self._log = self._prior
         self.observed = 0
+        self._gyro_shown = 0.0  # largest density that the samples of an interval have shown
         self._read()
 
     def expect(self, interval: ImuInterval, imu: ImuConfig) -> None:
@@ -124,7 +125,9 @@ class NoisePosterior:
         if len(seconds) < FEWEST_SAMPLES:
             return
         accel = _beyond(noise_of_samples(interval.forces, seconds), imu.accel_noise_density)
-        gyro = _beyond(noise_of_samples(interval.rates, seconds), imu.gyro_noise_density)
+        of_gyro = noise_of_samples(interval.rates, seconds)
+        self._gyro_shown = max(self._gyro_shown, of_gyro)
+        gyro = _beyond(of_gyro, imu.gyro_noise_density)
         prior = _prior(max(accel, _ACCEL_ERROR_SIGMA), max(gyro, _GYRO_ERROR_HALF))
         self._log = self._log + (prior - self._prior)
         self._prior = prior
@@ -160,15 +163,22 @@ class NoisePosterior:
         self.pair_variance = math.exp(pair_log)
 
     def findings(self, imu: ImuConfig) -> tuple[Finding, ...]:
-        """Sensors whose noise is more than twice the configured one for certain."""
+        """Sensors whose noise is more than twice the configured one for certain.
+
+        Innovations are as large if images turn otherwise, as with a zoom: the gyro is named where
+        its own samples have that noise, too.
+        """
         if self.observed < _LEAST_NAMED:
             return ()
-        gyro = _noise_finding(
-            Code.GYRO_NOISE,
-            imu.gyro_noise_density,
-            _GYRO_ERRORS,
-            self._of_gyro,
-        )
+        shows_noise = self._gyro_shown > _NAMED_RATIO * imu.gyro_noise_density
+        gyro = None
+        if shows_noise:
+            gyro = _noise_finding(
+                Code.GYRO_NOISE,
+                imu.gyro_noise_density,
+                _GYRO_ERRORS,
+                self._of_gyro,
+            )
         accel = _noise_finding(
             Code.ACCEL_NOISE,
             imu.accel_noise_density,

@@ -847,9 +847,11 @@ def _with_calibration(sample: FrontEndSample, scan: Scan, completion: Completion
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found = completion.found
     health = sample.health
-    # No calibration finds another unit, nor axes that no rotation corrects.
+    # No calibration finds another unit, nor axes that no rotation corrects, and it follows an
+    # object in the view as the sample does.
     beyond = any(
-        fault.code is Code.GYRO_UNIT or (fault.code is Code.AXES and not fault.estimated)
+        fault.code in (Code.GYRO_UNIT, Code.MOVING_OBJECT)
+        or (fault.code is Code.AXES and not fault.estimated)
         for fault in health.faults
     )
     if found is None or scan.intrinsics is None or beyond or not sample.is_lost:
