@@ -292,6 +292,11 @@ _FAULTY_NS = to_nanoseconds(1.0)
 _BEYOND = 3.0
 
 
+# Least length of the specific force at rest that is one [m/s^2]. A smaller one would name the
+# scale where the gyro is wrong. [chosen: below 0.98, that of an accelerometer in g]
+_LEAST_LENGTH = 0.9
+
+
 class AccelerationSums(LastSeconds):
     """Log Bayes factors of the measured acceleration and of its opposite, with their stamps."""
 
@@ -343,7 +348,9 @@ class AccelerationSums(LastSeconds):
                 Why.NO_SPECIFIC_FORCE,
                 evidence=Evidence(measured=measured),
             )
-        if abs(self._length - STANDARD_GRAVITY) > _BEYOND * self._length_sigma:
+        off = abs(self._length - STANDARD_GRAVITY)
+        # A gravity that a wrong gyro has turned away is no length of the force.
+        if self._length > _LEAST_LENGTH and off > _BEYOND * self._length_sigma:
             return Finding(
                 Code.ACCEL_SCALE,
                 FindingState.SUSPECT,

@@ -320,7 +320,7 @@ class ConsistencyMonitor:
             unknown = assessment.contradicting(*self.contradictions.counts)
             others = assessment.not_evaluated(set(), unknown.code)
             self.health = Assessment((unknown, *others))
-        if self._noise is not None and self._noise.state is FindingState.WRONG:
+        if not gross and self._noise is not None and self._noise.state is FindingState.WRONG:
             # Rows that the gyro turns wrongly say nothing of the other quantities.
             others = assessment.not_evaluated(set(), self._noise.code)
             self.health = Assessment((self._noise, *others))
