@@ -370,6 +370,8 @@ def portrait(recording: FieldRecording, turns: int, *, configured: bool = False)
     turned = recording.map_images(lambda _, pixels: np.rot90(pixels, turns))
     lens = {'focal_px': camera.fx, 'principal_point_px': [camera.cx, camera.cy]}
     truth = {**recording.truth, 'quat_cam_imu_xyzw': quat, **lens}
+    if turns == 2:
+        truth['readout_time_s'] = -recording.truth['readout_time_s']  # row 0 is read last
     return replace(turned, camera=camera, R_camera_image=R, truth=truth, parameters=parameters)
 
 
