@@ -371,7 +371,11 @@ def portrait(recording: FieldRecording, turns: int, *, configured: bool = False)
     lens = {'focal_px': camera.fx, 'principal_point_px': [camera.cx, camera.cy]}
     truth = {**recording.truth, 'quat_cam_imu_xyzw': quat, **lens}
     if turns == 2:
-        truth['readout_time_s'] = -recording.truth['readout_time_s']  # row 0 is read last
+        # Row 0, to which the time offset belongs, is read last.
+        readout = recording.truth['readout_time_s']
+        later = readout * (1.0 - 1.0 / camera.height)
+        truth['readout_time_s'] = -readout
+        truth['time_offset_s'] = recording.truth['time_offset_s'] + later
     return replace(turned, camera=camera, R_camera_image=R, truth=truth, parameters=parameters)
 
 
