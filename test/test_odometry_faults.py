@@ -573,13 +573,23 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
     for message in sorted(pairs, key=lambda message: stamp_of(message)):
         estimator.add_pair(PublishedPair.of_status(message))
         keyframes |= {keyframe.stamp_ns: keyframe for keyframe in estimator.take()}
-    of_keyframes = [message for message in received if stamp_of(message) in keyframes]
+
+    def nearest(message):
+        """Stamp of the keyframe next to a message: the order changes the learned offset."""
+        return min(keyframes, key=lambda stamp: abs(stamp - stamp_of(message)))
+
+    of_keyframes = [
+        message
+        for message in received
+        if abs(nearest(message) - stamp_of(message)) < SECOND // 2000
+    ]
     assert len(of_keyframes) >= 10
     for message, place in zip(of_keyframes, positions_of(of_keyframes), strict=True):
-        keyframe, q = keyframes[stamp_of(message)], message.pose.pose.orientation
-        np.testing.assert_allclose(place, keyframe.position, atol=1e-3)
+        keyframe, q = keyframes[nearest(message)], message.pose.pose.orientation
+        # Half a millisecond apart at 1.2 m/s and 60 deg/s.
+        np.testing.assert_allclose(place, keyframe.position, atol=2e-3)
         turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv() * Rotation.from_matrix(keyframe.R)
-        assert np.degrees(turn.magnitude()) < 0.01
+        assert np.degrees(turn.magnitude()) < 0.04
         assert message.header.frame_id == 'odom'
         assert message.child_frame_id == 'base_link'
 
