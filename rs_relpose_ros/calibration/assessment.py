@@ -726,6 +726,14 @@ _ROWS_MOVED = 0.5
 _FAST = 7e-3
 
 
+# 1 sigma of such a noise, relative. A smaller one would claim more than a pair's samples tell.
+# [derived: 1 / sqrt(2 n) of n = 50 independent values]
+_NOISE_SIGMA = 0.1
+# 1 sigma of the jitter of stamps, relative. A smaller one would claim more than 32 stamps tell.
+# [derived: 1 / sqrt(2 n) of n = 12 independent values, as three stamps make one change]
+_JITTER_SIGMA = 0.2
+
+
 def noise_of_gyro(pair: PairData, configured: Configured) -> Finding | None:
     """The finding on the noise that the samples of a pair show; None if it is as configured."""
     segment, active = pair.segment, configured.gyro_noise_density
@@ -741,7 +749,7 @@ def noise_of_gyro(pair: PairData, configured: Configured) -> Finding | None:
         Why.OFF,
         (active,),
         (segment.noise_density,),
-        0.1 * segment.noise_density,
+        _NOISE_SIGMA * segment.noise_density,
         'rad/s/sqrt(Hz)',
         evidence=Evidence(measured={'ratio': segment.noise_density / active, 'rows_px': moved}),
         settings={'gyro_noise_density': float(f'{segment.noise_density:.2g}')},
@@ -751,7 +759,13 @@ def noise_of_gyro(pair: PairData, configured: Configured) -> Finding | None:
 def jitter_of_stamps(sigma: float) -> Finding:
     """The finding that images are stamped on arrival, with the scatter [s] of the stamps."""
     return Finding(
-        Code.STAMP_JITTER, FindingState.SUSPECT, Why.OFF, (0.0,), (sigma,), 0.2 * sigma, 's'
+        Code.STAMP_JITTER,
+        FindingState.SUSPECT,
+        Why.OFF,
+        (0.0,),
+        (sigma,),
+        _JITTER_SIGMA * sigma,
+        's',
     )
 
 

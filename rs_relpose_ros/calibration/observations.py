@@ -26,6 +26,7 @@ from rs_relpose_ros.geometry.camera import readout_direction, RollingShutterCame
 from rs_relpose_ros.geometry.lens import N_LENS
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import integral, interpolated, mean_rates
+from rs_relpose_ros.imu.noise import density_of, third_differences
 
 # Axes of the camera, for people.
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
@@ -244,10 +245,7 @@ def noise_density(times: Array, rates: Array) -> float:
     even = is_usual[2:] & is_usual[1:-1] & is_usual[:-2]
     if not even.any():
         return 0.0
-    third = np.abs(np.diff(rates, n=3, axis=0))
-    # 1, -3, 3, -1 of independent samples; the median of a normal deviate's size is 0.6745.
-    sigma = np.median(third[even]) / 0.6745 / np.sqrt(20.0)
-    return float(sigma * np.sqrt(step))
+    return density_of(third_differences(rates)[even], times)
 
 
 # Frames further apart than so many intervals have lost some in between.

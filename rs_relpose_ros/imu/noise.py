@@ -31,7 +31,7 @@ def noise_of_samples(values: Array, seconds: Array) -> float:
     A motion hardly changes these at the rate of an IMU. A vibration is no white noise: its
     integral may be smaller.
     """
-    return _density(float(np.median(_third_differences(values))), seconds)
+    return density_of(third_differences(values), seconds)
 
 
 def shown_density(values: Array, seconds: Array, configured: float) -> float:
@@ -51,14 +51,15 @@ def shown_density(values: Array, seconds: Array, configured: float) -> float:
 
 
 def _of_noisiest_axis(values: Array, seconds: Array) -> float:
-    return _density(float(np.median(_third_differences(values), axis=0).max()), seconds)
+    return max(density_of(axis, seconds) for axis in third_differences(values).T)
 
 
-def _third_differences(values: Array) -> Array:
+def third_differences(values: Array) -> Array:
+    """Sizes (K - 3, 3) of the third differences of samples (K, 3)."""
     return np.abs(np.diff(values, n=3, axis=0))
 
 
-def _density(median: float, seconds: Array) -> float:
-    """Density by the median size of the third differences of samples at times (K,)."""
-    sigma = SIGMA_PER_MEDIAN * median / math.sqrt(_THIRD_DIFFERENCE)
+def density_of(differences: Array, seconds: Array) -> float:
+    """Density by sizes of third differences of samples at times (K,), of any axes."""
+    sigma = SIGMA_PER_MEDIAN * float(np.median(differences)) / math.sqrt(_THIRD_DIFFERENCE)
     return sigma * math.sqrt(float(np.median(np.diff(seconds))))
