@@ -42,7 +42,8 @@ ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
 PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
 OUT = ROOT / 'demo_out'
-BEFORE_AND_AFTER, PATH = 'global_shutter.png', 'path.png'
+BEFORE_AND_AFTER = 'global_shutter.png'
+PATH = 'path.png'
 
 STARTED = time.monotonic()
 

@@ -17,12 +17,10 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.messages import outgoing
 
 STAMP_NS = 1_700_000_000_123_456_789
-IMAGE, INFO, IMU, POSE = (
-    'sensor_msgs/msg/Image',
-    'sensor_msgs/msg/CameraInfo',
-    'sensor_msgs/msg/Imu',
-    'geometry_msgs/msg/PoseStamped',
-)
+IMAGE = 'sensor_msgs/msg/Image'
+INFO = 'sensor_msgs/msg/CameraInfo'
+IMU = 'sensor_msgs/msg/Imu'
+POSE = 'geometry_msgs/msg/PoseStamped'
 CAMERA = RollingShutterCamera(width=8, height=6, fx=5.0, fy=5.5, cx=3.5, cy=2.5, readout_time=0.03)
 PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 JAZZY = build.TYPESTORE
@@ -103,7 +101,8 @@ def write_kind(
     """A bag of one of `KINDS`, by default with `camera_messages`; `offered`: of its topics."""
     writer: Any
     if kind in ROS1_KINDS:
-        writer, typestore = Ros1Writer(folder / f'{kind}.bag'), NOETIC
+        writer = Ros1Writer(folder / f'{kind}.bag')
+        typestore = NOETIC
         if ROS1_KINDS[kind] is not None:
             writer.set_compression(ROS1_KINDS[kind])
 
@@ -111,7 +110,8 @@ def write_kind(
             return bytes(NOETIC.serialize_ros1(as_ros1(message), msgtype))
     else:
         storage, mode = ROSBAG2_KINDS[kind]
-        writer, typestore = Writer(folder / kind, version=9, storage_plugin=storage), JAZZY
+        writer = Writer(folder / kind, version=9, storage_plugin=storage)
+        typestore = JAZZY
         if mode is not CompressionMode.NONE:
             writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:

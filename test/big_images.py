@@ -12,7 +12,9 @@ import rclpy
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
-WIDTH, HEIGHT, RATE = 1920, 1080, 30.0
+WIDTH = 1920
+HEIGHT = 1080
+RATE = 30.0
 TOPIC = '/big_image'
 PATIENCE = 60.0
 
@@ -53,6 +55,7 @@ def receive(node: Any, count: int) -> None:
 
 if __name__ == '__main__':
     rclpy.init()
-    role, count = sys.argv[1], int(sys.argv[2])
+    role = sys.argv[1]
+    count = int(sys.argv[2])
     (send if role == 'send' else receive)(rclpy.create_node(f'big_images_{role}'), count)
     rclpy.shutdown()

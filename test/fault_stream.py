@@ -31,7 +31,10 @@ BAG_TOPICS = {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': IMU_T
 _TYPES = {IMU_TOPIC: Imu, CAMERA_INFO_TOPIC: CameraInfo, COMPRESSED_TOPIC: CompressedImage}
 
 # Of a phase [s]: begin and end of its fault, longest duration, and pause before the next one.
-FAULT_FROM, FAULT_UNTIL, PHASE, PAUSE = 0.25, 0.65, 1.55, 0.15
+FAULT_FROM = 0.25
+FAULT_UNTIL = 0.65
+PHASE = 1.55
+PAUSE = 0.15
 # The nodes go by stamps: phases are played faster than in real time.
 FASTER = 2.0
 
@@ -117,7 +120,8 @@ class Stream:
         A phase ends once there are `enough` results with stamps of its good end.
         """
         for phase in range(len(self._phases)) if phases is None else phases:
-            jump_ns, before = round(self._faults[phase].jump * SECOND), len(results)
+            jump_ns = round(self._faults[phase].jump * SECOND)
+            before = len(results)
             begin_ns = self._bag_first_ns + self._later_ns + jump_ns + round(FAULT_UNTIL * SECOND)
             # Delayed messages come later than the fault ends.
             faulty_ns = max(
@@ -125,7 +129,8 @@ class Stream:
                 for item in self._phases[phase]
                 if item.taken_ns < self._bag_first_ns + FAULT_UNTIL * SECOND
             )
-            started, last_ns = time.monotonic(), 0
+            started = time.monotonic()
+            last_ns = 0
             for item in self._phases[phase]:
                 if (
                     item.time_ns > faulty_ns
@@ -172,7 +177,8 @@ def read_messages(bag: Path, seconds: float, every: int = 1) -> list[tuple[int, 
 
 def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
     """Publish (publisher, bag time [ns], message) at bag time."""
-    first_ns, started = None, time.monotonic()
+    first_ns = None
+    started = time.monotonic()
     for publisher, bag_time_ns, message in messages:
         first_ns = bag_time_ns if first_ns is None else first_ns
         delay = started + (bag_time_ns - first_ns) * 1e-9 - time.monotonic()

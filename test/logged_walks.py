@@ -83,17 +83,16 @@ def write_movie(path: Path, walk: Simulation) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), 'w', format='mp4') as container:
         stream = container.add_stream('mpeg4', rate=8)
-        stream.width, stream.height, stream.pix_fmt = (
-            walk.camera.width,
-            walk.camera.height,
-            'yuv420p',
-        )
+        stream.width = walk.camera.width
+        stream.height = walk.camera.height
+        stream.pix_fmt = 'yuv420p'
         stream.codec_context.time_base = Fraction(1, 8)
         stream.bit_rate = 8_000_000
         for index in range(walk.config.frame_count):
             gray = walk.image(index)
             frame = av.VideoFrame.from_ndarray(cv2.merge([gray] * 3), format='bgr24')
-            frame.pts, frame.time_base = index, Fraction(1, 8)
+            frame.pts = index
+            frame.time_base = Fraction(1, 8)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
@@ -168,7 +167,8 @@ def stray_scanner(folder: Path, walk: Simulation) -> Path:
 
 def opencamera_sensors(folder: Path, walk: Simulation) -> Path:
     """The stamp is the last column; tables are in a folder of their own."""
-    name, inner = 'VID_20220102_030405', folder / '20220102_030405'
+    name = 'VID_20220102_030405'
+    inner = folder / '20220102_030405'
     write_movie(folder / f'{name}.mp4', walk)
     lines(inner / f'{name}_timestamps.csv', [[stamp] for stamp in stamps(walk)])
     lines(inner / f'{name}_gyro.csv', [[*rate, stamp] for stamp, rate, _ in samples(walk)])

@@ -205,7 +205,8 @@ def damaged(data: bytes, edits: Sequence[Edit]) -> bytes:
     out = bytearray(data)
     for place, way, value in edits:
         at = _at(place, len(out) + 1)
-        kind, size = way % 6, 1 + way % 63
+        kind = way % 6
+        size = 1 + way % 63
         if kind == 0 and at < len(out):
             out[at] ^= 1 << value % 8
         elif kind == 1:

@@ -76,13 +76,16 @@ def write_video(path: Path, ticks: Sequence[int], width: int = 64, height: int =
     av = pytest.importorskip('av', reason='needs the extra video')
     with av.open(str(path), 'w') as container:
         stream = container.add_stream('mpeg4', rate=30)
-        stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
+        stream.width = width
+        stream.height = height
+        stream.pix_fmt = 'yuv420p'
         stream.codec_context.time_base = Fraction(1, TICKS_PER_SECOND)
         stream.codec_context.gop_size = 4
         for number, tick in enumerate(ticks):
             pixels = np.full((height, width, 3), brightness(number), dtype=np.uint8)
             frame = av.VideoFrame.from_ndarray(pixels, format='bgr24')
-            frame.pts, frame.time_base = tick, Fraction(1, TICKS_PER_SECOND)
+            frame.pts = tick
+            frame.time_base = Fraction(1, TICKS_PER_SECOND)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 

@@ -74,7 +74,8 @@ class Keyframe:
 
     def __init__(self, world: NDArray[np.float64], time: float, rng: np.random.Generator) -> None:
         self.rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.1)
-        self.position, self.rate = time * VELOCITY, rng.normal(size=3)
+        self.position = time * VELOCITY
+        self.rate = rng.normal(size=3)
         self.velocity = self.rotation.inv().apply(VELOCITY)
         motion = uniform_motion(self.rotation, self.position, self.rate, self.velocity)
         self.pixels = observe(world, motion, VIEW, margin=np.inf)
@@ -101,7 +102,10 @@ def simulated_flight(
     world = rng.uniform([-4.0, -2.0, 6.0], [4.0, 2.0, 20.0], (points, 3))
     frames = [Keyframe(world, time, rng) for time in places]
     chosen = [np.arange(points)] * (len(TIMES) - 1) if tracks is None else list(tracks)
-    first, pairs, baselines, true_landmarks = frames[0], [], [], []
+    first = frames[0]
+    pairs = []
+    baselines = []
+    true_landmarks = []
     for k, (a, b, use) in enumerate(zip(frames[:-1], frames[1:], chosen, strict=True)):
         t = a.rotation.inv().apply(b.position - a.position)
         length = float(np.linalg.norm(t))

@@ -28,7 +28,8 @@ def calibrated(one: Recorded, camera: RollingShutterCamera) -> CalibrationResult
 
 def beside(one: Recorded, disparity: float = 10.0) -> Recorded:
     """Two views in one image: each point again, a width to the right."""
-    tracks, width = one.tracks, one.truth.width
+    tracks = one.tracks
+    width = one.truth.width
     points = np.concatenate([tracks.points, tracks.points + np.array([width - disparity, 0.0])])
     kept = np.ones(len(points), dtype=bool)
     kept[len(tracks.points) :] = tracks.points[:, 0] >= disparity

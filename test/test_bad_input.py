@@ -28,7 +28,8 @@ POINTS = {
     'global_5pt': 5,
     'uniform_11pt': 11,
 }
-WIDTH, HEIGHT = 640, 480
+WIDTH = 640
+HEIGHT = 480
 seeds = st.integers(0, 2**32 - 1)
 any_float = st.floats(allow_nan=True, allow_infinity=True)
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -182,10 +182,8 @@ SEVERAL = (
 
 
 def test_a_choice_among_several_with_or_without_the_slash(tmp_path):
-    path, chosen = (
-        topics_bag(tmp_path, *SEVERAL),
-        {'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'},
-    )
+    path = topics_bag(tmp_path, *SEVERAL)
+    chosen = {'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'}
     assert found(path, **chosen) == chosen
     assert found(path, **{role: name[1:] for role, name in chosen.items()}) == chosen
 
@@ -325,7 +323,8 @@ def split(folder: Path) -> Path:
     """Three files, of which the second one has one message, and the metadata of all."""
     bag = folder / 'split'
     messages = sorted(bag_kinds.camera_messages(), key=lambda entry: entry[3])
-    listed, parts = [], []
+    listed = []
+    parts = []
     for number, part in ((1, messages[:3]), (2, messages[3:4]), (10, messages[4:])):
         made = write_kind('mcap', folder, part)
         bag.mkdir(exist_ok=True)

@@ -175,7 +175,8 @@ def test_nees_of_errors_drawn_from_a_covariance(claimed):
 
 def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
     """At frames where the policy has no keyframes; the second overlaps both others."""
-    stamps, parameters = pair_errors.image_stamps(bundled_bag), read_parameters(BUNDLED_PARAMETERS)
+    stamps = pair_errors.image_stamps(bundled_bag)
+    parameters = read_parameters(BUNDLED_PARAMETERS)
     ends = [(stamps[first], stamps[last]) for first, last in ((60, 71), (65, 76), (71, 90))]
     (first, _), (last, _) = pair_errors.chosen_pairs(bundled_bag, parameters, ends[::2])
     assert [(pair.reference_stamp_ns, pair.stamp_ns) for pair in (first, last)] == ends[::2]
@@ -434,7 +435,8 @@ def test_tracks_are_where_the_renderer_shows_the_points_with_errors_since_the_re
 
 @pytest.mark.parametrize('name', [name for name in ROWS if name != RIGHT])
 def test_a_row_changes_something(name, recording):
-    right, samples = recording.configured, list(recording.samples)
+    right = recording.configured
+    samples = list(recording.samples)
     configured = ROWS[name].wrong(right, np.random.default_rng(0))
     # Some rows change the stamps from the fifth second on.
     last = replace(samples[-1], stamp_ns=samples[0].stamp_ns + 6_000_000_000)
@@ -453,13 +455,15 @@ TRUE_CAMERA = RollingShutterCamera(
     width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5, readout_time=0.02
 )
 PAN = (0.0, 0.1, 0.0)
-STEADY, CHANGING = ((0.0, 0.5, 0.0), (0.0, 0.5, 0.0)), ((0.0, 0.2, 0.0), (0.0, 0.8, 0.0))
+STEADY = ((0.0, 0.5, 0.0), (0.0, 0.5, 0.0))
+CHANGING = ((0.0, 0.2, 0.0), (0.0, 0.8, 0.0))
 
 
 def information_of(rotvec, rate1=(0.0, 0.0, 0.0), rate2=(0.0, 0.0, 0.0)):
     """Of a pair without noise, with rows as at rest."""
     rng = np.random.default_rng(0)
-    R, t = Rotation.from_rotvec(rotvec).as_matrix(), np.array([1.0, 0.0, 0.0])
+    R = Rotation.from_rotvec(rotvec).as_matrix()
+    t = np.array([1.0, 0.0, 0.0])
     points = rng.uniform((-1.5, -1.2, 3.0), (1.5, 1.2, 9.0), (120, 3))
     pixels = [
         450.0 * local[:, :2] / local[:, 2:] + (319.5, 239.5)

@@ -71,7 +71,8 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.
 # First places of entries with more than one value.
-BIAS, CENTER = model.BIAS.start, model.CENTER.start
+BIAS = model.BIAS.start
+CENTER = model.CENTER.start
 ROTATION = model.ROTATION.start
 # Of an unknown lens, as `calibrate --lens`.
 FREE_LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
@@ -181,7 +182,8 @@ def test_matches_beyond_the_fold_of_a_lens_are_dropped(share):
     )
     found, usual_one = (calibrate(one, recorded.gyro, lens) for one in (both, inside))
     for name in ('readout_time', 'time_offset'):
-        estimate, expected = getattr(found, name), getattr(usual_one, name)
+        estimate = getattr(found, name)
+        expected = getattr(usual_one, name)
         assert estimate.observable
         assert abs(estimate.value - expected.value) < expected.sigma
     turn = Rotation.from_matrix(found.R_cam_imu @ usual_one.R_cam_imu.T).magnitude()
@@ -432,7 +434,8 @@ def test_every_axis_map_is_recognised():
 )
 def test_search_finds_offset_and_rotation(rotation, axes):
     """Of a gyro 50 ms ahead."""
-    R, rng = Rotation.from_rotvec(rotation).as_matrix(), np.random.default_rng(3)
+    R = Rotation.from_rotvec(rotation).as_matrix()
+    rng = np.random.default_rng(3)
     times = np.arange(0.0, 6.0, 0.005)
     rates = axes * np.sin(2.0 * times[:, None] * [1.0, 1.7, 2.3]) * 0.4
     begins = np.linspace(0.5, 5.0, 120)
@@ -455,7 +458,8 @@ def few_pairs() -> tuple[model.Problem, model.Unknowns, Truth]:
     """Pairs, and a calibration a little off the truth."""
     rng = np.random.default_rng(1)
     recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
-    truth, tracks = recorded.truth, recorded.tracks
+    truth = recorded.truth
+    tracks = recorded.tracks
     pairs = make_pairs(tracks, (2,), PairSelection((), 60, 20, 99), 0.1, rng)
     problem = Observations.of(tracks, recorded.gyro, camera_of(truth)).problem(pairs, 0.05)
     # As of intervals that vary.
@@ -490,7 +494,8 @@ def test_a_step_of_the_axes_turns_the_camera_and_that_of_the_lens_is_true_minus_
 def test_gradient_is_that_of_finite_differences():
     problem, unknowns, _ = few_pairs()
     # At the optimum of the pairs' own unknowns the total derivative is the partial one.
-    every, held = np.ones(GLOBAL, dtype=bool), np.zeros(GLOBAL, dtype=bool)
+    every = np.ones(GLOBAL, dtype=bool)
+    held = np.zeros(GLOBAL, dtype=bool)
     for _ in range(40):
         local = evaluate(problem, unknowns, held).local_step(np.zeros(0))
         unknowns = stepped(unknowns, np.zeros(GLOBAL), 0.5 * local)
@@ -511,7 +516,8 @@ def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
     unknowns.parameters[model.LENS] = 0.0  # the points are moved in front of it
     residuals = evaluate(problem, unknowns).residuals
     # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
-    h, n = 1e-4, 17
+    h = 1e-4
+    n = 17
     gradient = np.zeros(4)
     for k in range(4):
         points = problem.points.copy()
@@ -549,7 +555,8 @@ def test_rays_are_the_same_through_every_camera_model(name):
     straight = problem(tracks.points, pinhole).points
     pixels = camera.project(pinhole.unproject(tracks.points))
     np.testing.assert_allclose(problem(pixels, camera).points, straight, atol=1e-9)
-    h, by_pixel = 1e-3, problem(pixels, camera).by_pixel
+    h = 1e-3
+    by_pixel = problem(pixels, camera).by_pixel
     for k in range(2):
         step = h * np.eye(2)[k]
         change = problem(pixels + step, camera).points - problem(pixels - step, camera).points
@@ -646,7 +653,8 @@ def test_exposure_becomes_two_parameters_of_the_node(tmp_path):
 
 def test_jitter_of_stamps_is_not_taken_for_exposure(tmp_path):
     recorded = simulated(19, fps=30.0, stamp_jitter=2.4e-3)
-    truth, result = recorded.truth, calibrated(recorded)
+    truth = recorded.truth
+    result = calibrated(recorded)
     assert result.offset_by_interval is None
     jitter = result.offset_by_jitter
     assert jitter.value == pytest.approx(1.0, abs=max(4.5 * jitter.sigma, 0.05))
@@ -731,7 +739,8 @@ def test_a_stretch_that_contradicts_the_others_has_less_weight():
     turns = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1)
     points = center + np.einsum('nij,nj->ni', turns.reshape(-1, 2, 2), tracks.points - center)
     final, _ = fitted(free_of(EXPOSURE), tracks=dataclasses.replace(tracks, points=points))
-    again, weights = final, np.ones(0)
+    again = final
+    weights = np.ones(0)
     for _ in range(2):
         weights = weights_of_stretches(again)
         weighted = final.problem._replace(weight=weights)
@@ -764,7 +773,8 @@ def test_a_fit_that_does_not_converge_has_wider_sigmas():
 
 def test_a_part_of_the_image_that_is_wrong_widens_the_sigmas():
     tracks = recorded().tracks
-    points, left = tracks.points.copy(), tracks.points[:, 0] < 400.0
+    points = tracks.points.copy()
+    left = tracks.points[:, 0] < 400.0
     # Sheared all the time, so that stretches of time agree: 3 % of the distance to column 160.
     points[left, 1] += 0.03 * (points[left, 0] - 160.0)
     final, _ = fitted(free_of(EXPOSURE), tracks=dataclasses.replace(tracks, points=points))
@@ -824,7 +834,8 @@ def test_what_the_data_determine_of_a_claim_is_no_doubt():
     held, _ = undisturbed()
     claimed = free_of(EXPOSURE) | knowledge.CLAIMED
     final, _ = fitted(claimed)
-    sigmas, prior = np.sqrt(np.diag(final.covariance)), final.problem.prior
+    sigmas = np.sqrt(np.diag(final.covariance))
+    prior = final.problem.prior
     for name in (model.FOCAL, model.SCALE.start, model.CENTER.start):
         assert sigmas[name] < 0.9 * prior[name, name] ** -0.5
     axes = np.arange(GLOBAL)[model.ROTATION]
@@ -885,7 +896,8 @@ def sharper(square: float) -> GyroSeries:
 
 def test_exposure_is_found():
     final, _ = fitted(free_of(), gyro=sharper(0.04**2))
-    found, sigma = final.unknowns.parameters, np.sqrt(np.diag(final.covariance))
+    found = final.unknowns.parameters
+    sigma = np.sqrt(np.diag(final.covariance))
     assert sigma[EXPOSURE] < 0.15 * 0.04**2
     assert abs(found[EXPOSURE] - 0.04**2) < 4.0 * sigma[EXPOSURE]
     assert abs(found[READOUT] - recorded().truth.readout_time) < 4.0 * sigma[READOUT]
@@ -893,7 +905,8 @@ def test_exposure_is_found():
 
 def test_exposure_is_not_given_where_it_would_average_the_noise():
     """White noise of the gyro of 0.06 rad/s at 200 Hz; the images have no exposure."""
-    source, rng = recorded(), np.random.default_rng(4)
+    source = recorded()
+    rng = np.random.default_rng(4)
     rates = source.gyro.rates + 0.06 * rng.normal(size=source.gyro.rates.shape)
     gyro = GyroSeries(source.gyro.stamps_ns, rates)
     data = observations.Observations.of(source.tracks, gyro, camera_of(source.truth))
@@ -912,7 +925,8 @@ def test_exposure_is_taken_in_by_the_readout_and_written(given, tmp_path):
         camera_of(source.truth),
         config=dataclasses.replace(TRACKED_IN_IMAGES, **given),
     )
-    readout, exposure = result.readout_time, result.exposure
+    readout = result.readout_time
+    exposure = result.exposure
     assert abs(readout.value - source.truth.readout_time) < 3.0 * readout.sigma < 3e-3
     assert abs(exposure.value - 0.03) <= 3.0 * exposure.sigma
     assert (exposure.sigma == 0.0) == bool(given)
@@ -942,7 +956,8 @@ def test_automatic_exposure_is_the_interval_less_a_margin():
 def evaluated_at(readout: float, sigma: float) -> tuple[CalibrationResult, Fit]:
     """Result where the fit has this readout time, its offset by -0.5 correlated with it."""
     final, data = undisturbed()
-    parameters, covariance = final.unknowns.parameters.copy(), final.covariance.copy()
+    parameters = final.unknowns.parameters.copy()
+    covariance = final.covariance.copy()
     parameters[READOUT] = readout
     covariance[READOUT], covariance[:, READOUT] = 0.0, 0.0
     covariance[READOUT, READOUT] = sigma**2
@@ -979,12 +994,14 @@ def test_a_readout_that_the_images_do_not_determine_is_that_of_the_interval():
 
 def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     final, data = fitted(free_of(EXPOSURE) | FREE_LENS, knowledge.LensKnowledge.GIVEN)
-    covariance, sigma = final.covariance.copy(), 0.015 * data.camera.width
+    covariance = final.covariance.copy()
+    sigma = 0.015 * data.camera.width
     covariance[CENTER, CENTER] += (10.0 * sigma) ** 2
     wide = dataclasses.replace(final, covariance=covariance)
     curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     result = evaluated(data, wide, curve, CalibrationConfig())
-    column, row = result.lens.column, result.lens.row
+    column = result.lens.column
+    row = result.lens.row
     assert 0.9 * sigma < column.sigma < 1.001 * sigma
     assert row.sigma == pytest.approx(math.sqrt(covariance[CENTER + 1, CENTER + 1]), rel=0.1)
     # Moved to the middle by all but a hundredth.
@@ -995,13 +1012,15 @@ def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_the_interval_between_frames_bounds_the_readout(sign):
     """Against draws from the normal distribution of which those beyond the bound are left out."""
-    interval, sigma = undisturbed()[1].interval, 1e-3
+    interval = undisturbed()[1].interval
+    sigma = 1e-3
     result, final = evaluated_at(sign * (interval + 5e-4), sigma)
     drawn_at = final.unknowns.parameters[READOUT] + sigma * np.random.default_rng(
         5
     ).standard_normal(1_000_000)
     mean = float(drawn_at[np.abs(drawn_at) <= interval].mean())
-    readout, moved = result.readout_time, mean - final.unknowns.parameters[READOUT]
+    readout = result.readout_time
+    moved = mean - final.unknowns.parameters[READOUT]
     assert readout.observable and abs(readout.value) < interval
     assert readout.value == pytest.approx(mean, abs=5e-6)
     assert readout.sigma == pytest.approx(sigma, rel=1e-6)
@@ -1055,7 +1074,8 @@ def repeated_fits(offsets: list[float]) -> list[Fit]:
 def test_recordings_that_agree_share_their_doubts_and_average_their_noise():
     fits = repeated_fits([0.05] * 4)
     found = combined(fits, np.zeros((4, 7)), 0)
-    alone, together = fits[0].covariance, found.fit.covariance
+    alone = fits[0].covariance
+    together = found.fit.covariance
     assert not found.between.any()
     assert found.fit.unknowns.parameters[OFFSET] == pytest.approx(0.05)
     assert together[READOUT, READOUT] == pytest.approx(alone[READOUT, READOUT] / 4.0, rel=1e-6)
@@ -1094,7 +1114,8 @@ def test_several_recordings_give_one_calibration():
         source = record(truth, rng)
         recordings.append(CalibrationInput(source.tracks, source.gyro, camera_of(truth), True, {}))
     common = calibrate_together(recordings, CalibrationConfig())
-    result, alone = common.result, common.of_recordings
+    result = common.result
+    alone = common.of_recordings
     assert result.frames == sum(one.frames for one in alone)
     readout = result.readout_time
     assert abs(readout.value - recorded().truth.readout_time) < 3.0 * readout.sigma < 2e-3
@@ -1161,7 +1182,8 @@ def test_jackknife_leaves_one_group_out_each():
     """Exact for a linear fit: the optimum without a group is that of the fit to the others."""
     rng = np.random.default_rng(7)
     groups = np.repeat(np.arange(6), 8)
-    A, y = rng.normal(size=(48, 3)), rng.normal(size=48)
+    A = rng.normal(size=(48, 3))
+    y = rng.normal(size=48)
     whole = np.linalg.lstsq(A, y, rcond=None)[0]
     parts = [np.flatnonzero(groups == g) for g in range(6)]
     moves = [
@@ -1181,7 +1203,8 @@ def test_halves_are_apart_if_what_is_measured_changes(shift, least, most):
     found = []
     for _ in range(60):
         values = rng.normal(size=10) + shift * np.repeat([-1.0, 1.0], 5)
-        scores, curvatures = (values.mean() - values)[:, None], np.ones((10, 1, 1))
+        scores = (values.mean() - values)[:, None]
+        curvatures = np.ones((10, 1, 1))
         groups = Groups(scores, curvatures, np.array([[10.0]]))
         found.append(groups.halves_apart(1.0))
     assert least < np.mean(found) < most

@@ -74,23 +74,29 @@ def test_the_chosen_tracker_is_used(bag, tmp_path, monkeypatch, refused):
 def nominal(message: Any) -> None:
     """A CameraInfo as of a data sheet: 10 % off, without distortion."""
     if hasattr(message, 'distortion_model'):
-        message.d, message.k = np.zeros(5), message.k * ([1.1, 1.0, 1.0, 1.0, 1.1] + 4 * [1.0])
+        message.d = np.zeros(5)
+        message.k = message.k * ([1.1, 1.0, 1.0, 1.0, 1.1] + 4 * [1.0])
 
 
 def binned(message: Any) -> None:
     nominal(message)
     if hasattr(message, 'distortion_model'):
-        message.width, message.height, message.binning_x, message.binning_y = 640, 480, 2, 2
+        message.width = 640
+        message.height = 480
+        message.binning_x = 2
+        message.binning_y = 2
         # The matrix of the full sensor: one of the binned image would count the binning twice.
         message.k = message.k * np.array([2.0, 1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
 def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
-    path, out = copied(bag, tmp_path / 'bag', nominal), tmp_path / 'out'
+    path = copied(bag, tmp_path / 'bag', nominal)
+    out = tmp_path / 'out'
     code, values = calibrated(path, out, '--lens')
     assert code == 0
     assert values['focal_px']['value'] == pytest.approx(225.0, rel=0.02)
-    poses, errors = [], []
+    poses = []
+    errors = []
     for parameters in (out / 'calibration.yaml', tmp_path / 'without.yaml'):
         if not parameters.exists():  # the same with the lens of the CameraInfo
             document = yaml.safe_load((out / 'calibration.yaml').read_text())
@@ -130,7 +136,8 @@ def test_lens_whose_coefficients_cancel_is_found(tmp_path):
     true = (0.163, -0.520, 0.0, 0.0, 0.474)
     config = replace(SMALL, distortion=true, duration=6.0)
     write_bag(simulate(config), tmp_path / 'walk')
-    path, out = copied(tmp_path / 'walk', tmp_path / 'bag', nominal), tmp_path / 'out'
+    path = copied(tmp_path / 'walk', tmp_path / 'bag', nominal)
+    out = tmp_path / 'out'
     code, values = calibrated(path, out, '--lens')
     assert code == 0
     for found, expected in zip(values['distortion'], (0.163, -0.520, 0.474), strict=True):

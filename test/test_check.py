@@ -36,7 +36,8 @@ from rs_relpose_ros.offline.check import check_bag, quantity_findings
 from rs_relpose_ros.offline.check_recording import StampStatistics
 from rs_relpose_ros.tracking.images import Pixels
 
-START, TYPES = 1_700_000_000_000_000_000, build.rosbags_types
+START = 1_700_000_000_000_000_000
+TYPES = build.rosbags_types
 MS = 1_000_000
 CAMERA = RollingShutterCamera(
     width=160,
@@ -67,7 +68,9 @@ class Small:
     """A bag of tiny images at 10 Hz and an IMU at 200 Hz; subclasses break one thing."""
 
     seconds = 4.0
-    image_topic, info_topic, imu_topic = '/camera/image_raw', '/camera/camera_info', '/imu'
+    image_topic = '/camera/image_raw'
+    info_topic = '/camera/camera_info'
+    imu_topic = '/imu'
     pixels = PIXELS
     rng = np.random.default_rng(1)
 
@@ -191,7 +194,8 @@ def of_another_size(self, stamp_ns):
     return outgoing.camera_info_message(stamp_ns, 'camera', camera, None, TYPES)
 
 
-W, F = FindingState.SUSPECT, FindingState.WRONG
+W = FindingState.SUSPECT
+F = FindingState.WRONG
 CLOSE = pytest.approx
 # What is broken, the finding, its state, and what distinguishes it: a literal of the fix, or
 # measured values.

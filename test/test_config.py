@@ -61,7 +61,8 @@ def test_node_accepts_the_template(ros_domain_id):
 def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
     """1920x1080 bgr8 at 30 Hz; with the default transports most of them are lost."""
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(CONFIG / 'fastdds.xml'))
-    script, count = ROOT / 'test' / 'big_images.py', 45
+    script = ROOT / 'test' / 'big_images.py'
+    count = 45
     # A queue of five is a sixth of a second: a busy machine may stop a process for longer.
     for _ in range(4):
         with Process(str(script), 'receive', str(count)) as receiver:

@@ -31,7 +31,8 @@ from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.camera_info import intrinsics_from_info
 from rs_relpose_ros.messages.incoming import stamp_ns
 
-IMAGES, INFO = '/camera/image_raw/compressed', '/camera/camera_info'
+IMAGES = '/camera/image_raw/compressed'
+INFO = '/camera/camera_info'
 TRUTH = '/ground_truth/pose'
 # Of a back camera with SENSOR_ORIENTATION 90: x is minus the phone's y, and so on.
 PHONE_AXES = Rotation.from_matrix([[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
@@ -247,7 +248,8 @@ def test_lens_profile_that_does_not_fit(tmp_path, changes, words):
 
 
 def test_lens_profiles_to_choose_from(tmp_path):
-    path, folder = made.make_video(tmp_path), tmp_path / 'profiles'
+    path = made.make_video(tmp_path)
+    folder = tmp_path / 'profiles'
     folder.mkdir()
 
     def check(words: str, place: Path = folder) -> None:
@@ -288,7 +290,8 @@ def frames_overwritten(folder: Path) -> Path:
     """The index is complete, the frames are not."""
     path = made.make_video(folder)
     data = path.read_bytes()
-    start, end = data.index(b'mdat') + 4, data.index(b'moov') - 4
+    start = data.index(b'mdat') + 4
+    end = data.index(b'moov') - 4
     path.write_bytes(data[:start] + b'\xff' * (end - start) + data[end:])
     return path
 
@@ -330,7 +333,8 @@ def test_posecam(tmp_path):
     read = converted('android', made.make_posecam(tmp_path / 'in'), tmp_path / 'bag')
     assert read.stamps() == [stamp for number, stamp in enumerate(made.STAMPS) if number != 2]
     assert read.of(IMAGES)[2].data.tobytes() == made.picture(3)
-    gyro, accel = read.samples('/imu/gyro'), read.samples('/imu/accel')
+    gyro = read.samples('/imu/gyro')
+    accel = read.samples('/imu/accel')
     assert [sample.stamp_ns for sample in accel] == made.IMU_STAMPS
     assert gyro[0].stamp_ns == made.IMU_STAMPS[0] + made.MILLISECOND
     assert gyro[0].angular_velocity == (-5.5e-4, 0.25, 0.5) and gyro[0].linear_acceleration is None
@@ -636,7 +640,8 @@ def test_paths_that_cannot_be_used(tmp_path, refused):
 )
 def test_parameter_file_is_that_of_the_command(tmp_path, dataset, axes, degrees):
     """With axes within some degrees of those of its device."""
-    file, (title, values) = ROOT / 'config' / f'{dataset}.yaml', datasets.packaged(dataset)
+    file = ROOT / 'config' / f'{dataset}.yaml'
+    (title, values) = datasets.packaged(dataset)
     for path in (file, ROOT / 'rs_relpose_lab' / 'recordings' / f'{dataset}.yaml'):
         assert path.read_text() == parameter_text(title, values)
     parameters = read_parameters(file)
@@ -673,7 +678,9 @@ def test_xiaomi_recording(recordings, tmp_path):
 
 def rotates_as_its_images(read: Converted) -> None:
     """Pan of the images, by far points, against the gyro."""
-    gyro, shifts, before = read.samples('/imu/gyro'), [], None
+    gyro = read.samples('/imu/gyro')
+    shifts = []
+    before = None
     times = np.array([sample.stamp_ns - START_NS for sample in gyro]) * 1e-9
     yaw = np.array([sample.angular_velocity[1] for sample in gyro])
     rotation = np.concatenate([[0.0], np.cumsum(yaw[1:] * np.diff(times))])
@@ -697,7 +704,8 @@ def test_gopro(recordings, tmp_path):
         round(k * 1001 / 30000 * 1e9) for k in range(362)
     ]
     rotates_as_its_images(read)
-    gyro, accel = read.stamps('/imu/gyro'), read.stamps('/imu/accel')
+    gyro = read.stamps('/imu/gyro')
+    accel = read.stamps('/imu/accel')
     assert len(gyro) == 4795 and len(accel) == 2397
     # The accelerometer has half the gyro's rate, and covers the same time.
     assert np.diff(accel).mean() == pytest.approx(2 * np.diff(gyro).mean(), rel=1e-3)

@@ -55,7 +55,8 @@ def poses_are_right(walk, folder, bag, *settings):
         rows = [row for row in csv.DictReader(file) if row['tx'] not in ('', 'nan')]
     assert len(rows) >= 2
     shift = made.stamps(walk)[0] - min(int(row['reference_stamp_ns']) for row in rows)
-    rotations, translations = [], []
+    rotations = []
+    translations = []
     for row in rows:
         times = [int(row[name]) + shift for name in ('reference_stamp_ns', 'stamp_ns')]
         states = walk.states(times)
@@ -122,7 +123,8 @@ def test_poses_of_stray_scanner_are_the_truth(walk, tmp_path):
     for message, R, p in zip(
         read.of('/ground_truth/pose'), states.R_world_cam, states.position, strict=True
     ):
-        q, position = message.pose.orientation, message.pose.position
+        q = message.pose.orientation
+        position = message.pose.position
         np.testing.assert_allclose(
             Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), R, atol=1e-9
         )
@@ -145,7 +147,8 @@ def test_euroc_against_the_walk(tmp_path):
     assert read.readout[0] is None
     states = walk.states(walk.imu.stamps_ns)
     message = read.of('/ground_truth/pose')[17]
-    q, position = message.pose.orientation, message.pose.position
+    q = message.pose.orientation
+    position = message.pose.position
     turned = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     np.testing.assert_allclose(turned, states.R_world_cam[17], atol=1e-7)
     np.testing.assert_allclose(
@@ -266,7 +269,8 @@ CALIBRATIONS = {
 @pytest.mark.parametrize('name', CALIBRATIONS)
 def test_calibration_of_another_tool(name, tmp_path, caplog, capsys):
     text, offset = CALIBRATIONS[name]
-    path, out = tmp_path / f'{name}.yaml', tmp_path / 'mine.yaml'
+    path = tmp_path / f'{name}.yaml'
+    out = tmp_path / 'mine.yaml'
     path.write_text('\ufeff' + text if name == 'kalibr' else text)
     given = read_parameters(path)
     assert 'is a calibration file' in caplog.text and 'quat_cam_imu_xyzw' in caplog.text

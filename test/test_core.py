@@ -74,7 +74,8 @@ def test_derivatives_of_a_match_equal_finite_differences():
 
 def test_depths_are_those_of_points_in_front_of_and_behind_the_cameras():
     rng = np.random.default_rng(3)
-    baselines, true_depths = rng.normal(size=(30, 3)), rng.uniform(2.0, 9.0, (30, 2))
+    baselines = rng.normal(size=(30, 3))
+    true_depths = rng.uniform(2.0, 9.0, (30, 2))
     true_depths[::3] *= -1.0
     h = rng.normal(size=(30, 3))
     h /= np.linalg.norm(h, axis=1, keepdims=True)
@@ -124,7 +125,8 @@ def random_information(rng, n):
 
 def test_eliminated_unknowns_are_at_the_optimum_for_the_kept_ones():
     rng = np.random.default_rng(5)
-    H, g = random_information(rng, 7), rng.normal(size=7)
+    H = random_information(rng, 7)
+    g = rng.normal(size=7)
     kept = rng.normal(size=3)
     own = np.linalg.solve(H[3:, 3:], -g[3:] - H[3:, :3] @ kept)
     x = np.concatenate([kept, own])
@@ -139,7 +141,8 @@ def test_eliminated_unknowns_are_at_the_optimum_for_the_kept_ones():
 
 def test_damped_step_is_newtons_without_damping_and_short_with_it():
     rng = np.random.default_rng(6)
-    H, g = random_information(rng, 5), rng.normal(size=5)
+    H = random_information(rng, 5)
+    g = rng.normal(size=5)
     step, gain = least_squares.damped_step(H, g, 0.0)
     np.testing.assert_allclose(step, np.linalg.solve(H, -g), rtol=1e-9)
     assert gain == pytest.approx(-g @ step)
@@ -153,8 +156,10 @@ def test_groups_are_solved_as_their_matrices_one_by_one():
     rng = np.random.default_rng(7)
     matrices = np.array([random_information(rng, 4) for _ in range(9)])
     right = rng.normal(size=(9, 4))
-    own, values = np.ascontiguousarray(np.moveaxis(matrices, 0, 2)), right.T.copy()
-    factors, lower = np.zeros_like(own), np.empty_like(values)
+    own = np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
+    values = right.T.copy()
+    factors = np.zeros_like(own)
+    lower = np.empty_like(values)
     least_squares.factor_groups(own, factors)
     least_squares.solve_lower_groups(factors, values, lower)
     roots = np.linalg.cholesky(matrices)
@@ -166,7 +171,8 @@ def test_groups_are_solved_as_their_matrices_one_by_one():
 def test_covariance_by_groups_is_that_of_correlated_errors():
     """Of a mean per unknown: groups of four equal errors count as one observation each."""
     rng = np.random.default_rng(8)
-    groups, found = 30, []
+    groups = 30
+    found = []
     J = rng.normal(size=(groups, 4, 2))
     curvatures = np.einsum('gki,gkj->gij', J, J)
     hessian = curvatures.sum(axis=0)

@@ -102,8 +102,12 @@ class Filter:
 
 
 def measured(message: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    pose, twist = message.pose.pose, message.twist.twist
-    p, q, v, w = pose.position, pose.orientation, twist.linear, twist.angular
+    pose = message.pose.pose
+    twist = message.twist.twist
+    p = pose.position
+    q = pose.orientation
+    v = twist.linear
+    w = twist.angular
     return (
         np.array([p.x, p.y, p.z]),
         Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
@@ -122,7 +126,8 @@ def seconds_between(first: Odometry, second: Odometry) -> float:
 def error_in_sigmas(published: Published, begin: int, end: int) -> float:
     """Squared error of the movement between two states, by the covariance that the second adds."""
     truth = published.walk.truth
-    one, other = published.states[begin], published.states[end]
+    one = published.states[begin]
+    other = published.states[end]
     R = one.R @ truth.rotation(one.imu_ns).T  # the world of the path, in which z is up, too
     moved = other.position - one.position
     true = R @ (truth.position(other.imu_ns) - truth.position(one.imu_ns))
@@ -134,7 +139,8 @@ def error_in_sigmas(published: Published, begin: int, end: int) -> float:
 
 
 def test_the_loss_is_silence_and_the_recovery_another_path_in_the_same_frame(published):
-    states, first = published.states, published.first_after
+    states = published.states
+    first = published.first_after
     assert published.estimator.counts['lost'] == 1
     silence = seconds_between(published.messages[first - 1], published.messages[first])
     assert silence > 1.0
@@ -146,7 +152,8 @@ def test_the_loss_is_silence_and_the_recovery_another_path_in_the_same_frame(pub
 
 def test_the_covariance_after_a_loss_covers_it(published):
     """It is not that of a path that begins: what the silence added is in it."""
-    states, first = published.states, published.first_after
+    states = published.states
+    first = published.first_after
     sigma = [float(np.sqrt(np.trace(one.pose_covariance[:3, :3]))) for one in states]
     assert sigma[first] > 1.3 * sigma[first - 1] > 1.3 * min(sigma[:first])
     assert max(error_in_sigmas(published, 10, k) for k in range(20, len(states), 5)) < 4.0
@@ -161,8 +168,10 @@ def test_a_filter_follows_through_a_loss(published):
     text = (ROOT / 'config' / 'robot_localization.yaml').read_text()
     ekf = yaml.safe_load(text)['ekf_filter_node']['ros__parameters']
     assert ekf['odom0_config'][:12] == [True] * 12 and ekf['frequency'] == 1.0 / STEP
-    messages, first = published.messages, published.first_after
-    after_silence, spread = [], []
+    messages = published.messages
+    first = published.first_after
+    after_silence = []
+    spread = []
     fusing = Filter(messages[0])
     for k, (before, message) in enumerate(pairwise(messages), start=1):
         fusing.predict(seconds_between(before, message))
@@ -180,7 +189,8 @@ def test_a_filter_follows_through_a_loss(published):
 
 def test_a_filter_that_kept_the_covariance_from_before_the_loss_would_be_too_certain(published):
     """What the covariance after the loss is for: the filter knows as little as the odometry."""
-    messages, first = published.messages, published.first_after
+    messages = published.messages
+    first = published.first_after
     old = np.reshape(messages[first // 2].pose.covariance, (6, 6))
     sigmas = []
     for covariance in (None, old):

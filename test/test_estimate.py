@@ -44,7 +44,8 @@ def sigmas(R, truth, covariance):
 
 def test_a_pair_without_consensus_has_few_samples():
     """Matches at random with the gyro's rotation; without it, each solver has all samples."""
-    scene, rng = make_scene(5, outliers=0.0), np.random.default_rng(5)
+    scene = make_scene(5, outliers=0.0)
+    rng = np.random.default_rng(5)
     scene = replace(scene, points2=rng.permutation(scene.points2))
     aided = estimate(
         scene, relative_rotation=scene.R, relative_rotation_covariance=1e-6 * np.eye(3)
@@ -74,7 +75,8 @@ def test_a_pair_without_consensus_has_few_samples():
 )
 def test_accuracy(cell, rotation, translation):
     """Medians over 8 scenes; the last case is without gravity. Outliers are found."""
-    errors, found = [], []
+    errors = []
+    found = []
     for seed in range(8):
         scene = make_scene(seed, **(cell or {}))
         pose = estimate(scene, gravity=cell is not None)
@@ -175,8 +177,10 @@ def gyro_prior(scene, error=(0.0, 0.0, 0.0), sigma=2e-4, **config):
 
 def test_a_gyro_that_disagrees_with_the_images_widens_the_covariance():
     scene = make_scene(1, outliers=0.0, gravity_noise=0.0, gyro_noise=0.0)
-    right, wrong = gyro_prior(scene), gyro_prior(scene, (0.0, 2e-3, 0.0))
-    before, after = right.covariance[3:, 3:], wrong.covariance[3:, 3:]
+    right = gyro_prior(scene)
+    wrong = gyro_prior(scene, (0.0, 2e-3, 0.0))
+    before = right.covariance[3:, 3:]
+    after = wrong.covariance[3:, 3:]
     assert np.trace(after) > 4.0 * np.trace(before)
     assert rotation_nees(wrong, scene.R, after) < 3.0
     assert rotation_nees(wrong, scene.R, before) > 6.0
@@ -198,13 +202,12 @@ def test_a_gyro_that_contradicts_the_images_has_no_pose(seed):
 @pytest.mark.parametrize(('share', 'status'), [(0.5, 'LOW_PARALLAX'), (0.7, 'OK')])
 def test_a_direction_whose_sign_the_depths_do_not_determine(share, status):
     """Matches on exact epipolar lines, a share of them in front of the cameras."""
-    rng, camera = (
-        np.random.default_rng(0),
-        RollingShutterCamera(
-            width=1280, height=720, fx=600.0, fy=600.0, cx=639.5, cy=359.5, readout_time=0.03
-        ),
+    rng = np.random.default_rng(0)
+    camera = RollingShutterCamera(
+        width=1280, height=720, fx=600.0, fy=600.0, cx=639.5, cy=359.5, readout_time=0.03
     )
-    R, t = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), np.array([0.8, 0.1, 0.6])
+    R = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix()
+    t = np.array([0.8, 0.1, 0.6])
     points = rng.uniform([-4, -2, 8], [4, 2, 20], (300, 3))
     sign = np.where(rng.uniform(size=300) < share, 1.0, -1.0)[:, None]
     pixels = [
@@ -231,7 +234,8 @@ def test_errors_of_the_stamps_are_in_the_covariance_and_not_in_the_pose():
     exact, late = (gyro_prior(scene, sigma=1e-5, stamp_sigma=s) for s in (0.0, sigma))
     assert np.array_equal(late.R, exact.R) and np.array_equal(late.t, exact.t)
     # The configured sigma of the gyro is so small that it decides: R has all of its error.
-    w1, w2 = scene.measured_rate1, scene.R @ scene.measured_rate2
+    w1 = scene.measured_rate1
+    w2 = scene.R @ scene.measured_rate2
     expected = sigma**2 * (np.outer(w1, w1) + np.outer(w2, w2))
     added = late.covariance[3:, 3:] - exact.covariance[3:, 3:]
     assert added == pytest.approx(expected, abs=0.1 * np.abs(expected).max())
@@ -239,7 +243,8 @@ def test_errors_of_the_stamps_are_in_the_covariance_and_not_in_the_pose():
 
 def test_equal_state_gives_equal_bits_another_seed_or_solver_nearly_the_same():
     scene = make_scene(2)
-    a, b = estimate(scene, rng=7), estimate(scene, rng=7)
+    a = estimate(scene, rng=7)
+    b = estimate(scene, rng=7)
     assert np.array_equal(a.R, b.R) and np.array_equal(a.covariance, b.covariance)
     generator = estimate(scene, rng=np.random.default_rng(7))
     assert np.array_equal(a.R, generator.R)
@@ -377,7 +382,9 @@ def by_images(pose):
 
 def test_the_gyro_between_the_frames_has_no_part_in_it():
     """A gyro with an error of 4 sigmas pulls the pose, and not the rotation by the images."""
-    sigma, moved, moved_images = 3e-4, [], []
+    sigma = 3e-4
+    moved = []
+    moved_images = []
     for seed in range(1, 9):
         scene = make_scene(seed, constant_velocity=True)
         poses = [
@@ -454,7 +461,8 @@ def test_baseline_and_direction(scenes):
 
 
 def test_a_baseline_is_given_only_if_it_is_known(scenes):
-    scene, inertial = scenes[1], scenes[1].arguments['inertial']
+    scene = scenes[1]
+    inertial = scenes[1].arguments['inertial']
     pose = scene.pose(between=(), inertial=None)
     assert pose and np.isnan([pose.baseline, pose.baseline_log_sigma]).all()
     assert 'no acceleration' in pose.diagnostics.baseline_reason
@@ -466,7 +474,8 @@ def test_a_baseline_is_given_only_if_it_is_known(scenes):
 
 
 def test_interval_duration_inverse_and_lever_arm_of_a_baseline(scenes):
-    scene, inertial = scenes[1], scenes[1].arguments['inertial']
+    scene = scenes[1]
+    inertial = scenes[1].arguments['inertial']
     pose = scene.pose(between=())
     assert (pose.inverse().baseline, pose.inverse().baseline_log_sigma) == (
         pose.baseline,
@@ -491,7 +500,8 @@ def test_interval_duration_inverse_and_lever_arm_of_a_baseline(scenes):
 
 
 def evidence(scene, pose, inertial):
-    given, nothing = scene.arguments, np.empty((0, 2))
+    given = scene.arguments
+    nothing = np.empty((0, 2))
     problem = build_problem(
         nothing,
         nothing,
@@ -513,7 +523,8 @@ def evidence(scene, pose, inertial):
 @pytest.mark.parametrize('with_accelerometer', [True, False])
 def test_images_distinguish_the_acceleration_from_another_one(scenes, with_accelerometer):
     """By the images alone, independently of the prior of the pose."""
-    right, permuted = [], []
+    right = []
+    permuted = []
     axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     for scene in scenes:
         configured = scene.arguments['inertial']
@@ -545,8 +556,12 @@ def test_evidence_by_the_density_of_the_acceleration():
     """At one baseline: y of the images is normal, and so is the expected acceleration."""
     rng = np.random.default_rng(3)
     half = rng.normal(size=(8, 12))
-    H, g, b, c = half @ half.T, rng.normal(size=8), 0.3, 4.0
-    t, velocities = np.array([0.6, 0.0, 0.8]), rng.normal(size=6)
+    H = half @ half.T
+    g = rng.normal(size=8)
+    b = 0.3
+    c = 4.0
+    t = np.array([0.6, 0.0, 0.8])
+    velocities = rng.normal(size=6)
     basis = tangent_basis(t)
     J = np.hstack([-c * np.vstack([basis, basis]), np.eye(6)])
     mean = b * (velocities - c * np.tile(t, 2) - J @ np.linalg.solve(H, g))
@@ -559,7 +574,8 @@ def test_evidence_by_the_density_of_the_acceleration():
             multivariate_normal(mean, covariance + V).logpdf(-a),
         )
 
-    first, second = both(rng.normal(size=6), 0.3 * np.eye(6)), both(np.zeros(6), 2.0 * np.eye(6))
+    first = both(rng.normal(size=6), 0.3 * np.eye(6))
+    second = both(np.zeros(6), 2.0 * np.eye(6))
     assert first[0] - second[0] == pytest.approx(first[1] - second[1], abs=1e-9)
 
 
@@ -639,7 +655,8 @@ def stepped(state, step):
 @pytest.mark.parametrize('seed', range(3))
 def test_jacobian_equals_finite_differences(seed):
     rng = np.random.default_rng(seed)
-    rows, state = random_observations(rng), random_state(rng)
+    rows = random_observations(rng)
+    state = random_state(rng)
     exact = sampson.jacobian(rows, state)
     step = 1e-6
     for k in range(PARAMETERS):
@@ -661,10 +678,12 @@ def constraint(rows, state):
 def test_residual_is_the_constraint_over_its_gradient_by_pixels():
     """The Sampson error by its definition, with differences for the derivatives."""
     rng = np.random.default_rng(1)
-    rows, state = random_observations(rng, 20), random_state(rng)
+    rows = random_observations(rng, 20)
+    state = random_state(rng)
     gradient = np.empty((len(rows), 4))
     for k, (ray, derivative) in enumerate(((0, 3), (0, 6), (9, 12), (9, 15))):
-        ahead, back = rows.copy(), rows.copy()
+        ahead = rows.copy()
+        back = rows.copy()
         ahead[:, ray : ray + 3] += rows[:, derivative : derivative + 3]
         back[:, ray : ray + 3] -= rows[:, derivative : derivative + 3]
         # Exact: the constraint is linear in either ray.
@@ -685,12 +704,14 @@ def test_depths_of_exact_matches():
     points1 = rng.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 12.0], (30, 3))
     # A point observed at tau_1 and tau_2: l_1 f_1 = l_2 R f_2 + t - tau_1 d_1 + tau_2 d_2.
     points2 = (points1 - t + rows[:, 18:19] * d1 - rows[:, 19:20] * d2) @ R
-    depth1, depth2 = np.linalg.norm(points1, axis=1), np.linalg.norm(points2, axis=1)
+    depth1 = np.linalg.norm(points1, axis=1)
+    depth2 = np.linalg.norm(points2, axis=1)
     rows[:, 0:3], rows[:, 9:12] = points1 / depth1[:, None], points2 / depth2[:, None]
     for k in range(30):
         *depths, parallax, baseline = sampson.triangulated(rows, k, state)
         np.testing.assert_allclose(depths, [depth1[k], depth2[k]], rtol=1e-8)
-        f1, h = rows[k, 0:3], R @ rows[k, 9:12]
+        f1 = rows[k, 0:3]
+        h = R @ rows[k, 9:12]
         assert parallax == pytest.approx(np.linalg.norm(np.cross(f1, h)))
         moved = t - rows[k, 18] * d1 + rows[k, 19] * d2
         assert baseline == pytest.approx(np.linalg.norm(moved))

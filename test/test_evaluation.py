@@ -285,7 +285,8 @@ def test_the_optimum_is_the_truth_without_noise_and_independent_of_the_start():
         tilt = Rotation.from_rotvec(np.radians(degrees)).as_matrix()
         return oracle_estimate(problem, *sigmas, start=(tilt @ problem.R, tilt @ problem.t))
 
-    exact, noisy = make_problem(Cell(**NO_NOISE), 3), make_problem(Cell(), 4)
+    exact = make_problem(Cell(**NO_NOISE), 3)
+    noisy = make_problem(Cell(), 4)
     found = started_off(exact, [1.0, -2.0, 1.0], 1e-3, 1e-5, 1e-5)
     error = pose_error(found.R, found.t, exact.R, exact.t)
     assert error.rotation < 1e-4

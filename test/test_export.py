@@ -58,7 +58,8 @@ def run(bundled_bag, trajectory, rows, tmp_path):
     def export_it(
         *options: str, tracks: KeyframeObservations | None = None, **changes: Any
     ) -> tuple[int, Path]:
-        out, given = tmp_path / 'model', trajectory
+        out = tmp_path / 'model'
+        given = trajectory
         if tracks or changes:
             given = shutil.copytree(trajectory, tmp_path / 'other')
             export.replace(rows, **changes).save(given / 'trajectory_rows.npz')
@@ -157,7 +158,8 @@ def test_a_tum_file_at_any_rate(bundled_bag, rows, trajectory, tmp_path):
 def test_raw_images_are_those_of_the_bag(run, messages, capsys):
     code, out = run('--format', 'gsplat')
     assert code == 0
-    value, report = np.load(out / 'cameras.npz'), report_of(out)
+    value = np.load(out / 'cameras.npz')
+    report = report_of(out)
     names = value['names'].tolist()
     assert sorted(path.name for path in (out / 'images').iterdir()) == names
     assert {int(name[:-4]): (out / 'images' / name).read_bytes() for name in names} == {

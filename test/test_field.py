@@ -101,7 +101,8 @@ def test_a_rotated_camera_observes_the_same_points(base, turns):
     """A ray of a pixel before is the ray of the rotated pixel after, in the rotated axes."""
     rotated = defects.portrait(base, turns)
     pixels = np.array([[20.0, 30.0], [140.0, 100.0], [80.0, 10.0]])
-    moved, width = pixels, base.camera.width
+    moved = pixels
+    width = base.camera.width
     height = base.camera.height
     for _ in range(turns):
         moved = np.stack([moved[:, 1], width - 1.0 - moved[:, 0]], axis=1)

@@ -39,8 +39,10 @@ class Motion:
 
     def __init__(self, rng):
         self.velocity = rng.normal([0.5, 0.0, 0.3], 0.6)
-        self.acceleration, self.jerk = rng.normal(0.0, 2.0, 3), rng.normal(0.0, 10.0, 3)
-        self.rate, self.angular_acceleration = rng.normal(0.0, 0.3, 3), rng.normal(0.0, 1.0, 3)
+        self.acceleration = rng.normal(0.0, 2.0, 3)
+        self.jerk = rng.normal(0.0, 10.0, 3)
+        self.rate = rng.normal(0.0, 0.3, 3)
+        self.angular_acceleration = rng.normal(0.0, 1.0, 3)
 
     def R(self, s):
         s = np.asarray(s, dtype=float)[..., None]
@@ -115,7 +117,8 @@ class Scene:
             for o, s in zip(off, TIMES, strict=True)
         ]
         covariances = [(GYRO_WALK**2 * s + BIAS_SIGMA**2 * s * s) * np.eye(3) for s in TIMES]
-        self.R, self.t = motion.R(ends), motion.p(ends) / np.linalg.norm(motion.p(ends))
+        self.R = motion.R(ends)
+        self.t = motion.p(ends) / np.linalg.norm(motion.p(ends))
         self.baseline = np.linalg.norm(motion.p(ends))
         error = gyro * GRAVITY_ERROR
         self.between = [
@@ -218,7 +221,11 @@ def test_all_frames_beat_two_views():
 
 
 def test_covariance_is_that_of_the_errors():
-    chi2, logs, lengths, starts, by_gyro = [], [], [], [], []
+    chi2 = []
+    logs = []
+    lengths = []
+    starts = []
+    by_gyro = []
     for seed in range(100, 140):
         scene = Scene(seed)
         pose = scene.pose()
@@ -251,16 +258,19 @@ class Late(Scene):
         self.delays = np.random.default_rng(seed).exponential(sigma, len(TIMES))
         super().__init__(seed)
         first, last = TIMES[[0, -1]] + self.delays[[0, -1]]
-        R, p = self.motion.R(np.array([first, last])), self.motion.p(np.array([first, last]))
+        R = self.motion.R(np.array([first, last]))
+        p = self.motion.p(np.array([first, last]))
         t = R[0].T @ (p[1] - p[0])
-        self.R, self.t = R[0].T @ R[1], t / np.linalg.norm(t)
+        self.R = R[0].T @ R[1]
+        self.t = t / np.linalg.norm(t)
 
     def observe(self, points, s):
         return super().observe(points, s + self.delays[int(np.argmin(np.abs(TIMES - s)))])
 
 
 def test_covariance_contains_errors_of_the_stamps_of_each_frame():
-    sigma, chi2 = 0.006, {0.0: [], 0.006: []}
+    sigma = 0.006
+    chi2 = {0.0: [], 0.006: []}
     for seed in range(200, 225):
         scene = Late(seed, sigma)
         for stated, found in chi2.items():
@@ -282,7 +292,8 @@ def test_derivatives_are_those_of_the_cost(fitted):
     """The tracks move with the path, so that the reduced gradient is that of the cost."""
     _, arguments, _ = fitted
     # Without rotations, whose first order is used.
-    state, sigma = arguments[2], 0.4
+    state = arguments[2]
+    sigma = 0.4
     state = state._replace(bias=np.zeros(3), rotations=np.zeros_like(state.rotations))
     _, normal = cost_of(state, arguments, sigma)
     normal.tracks[:, -1] = 0.0
@@ -323,10 +334,12 @@ def from_state(state, other):
 
 def with_changes(tracks, changes, step):
     """The observations after a step (D,) of the deviations."""
-    V, N = len(tracks.used), tracks.number
+    V = len(tracks.used)
+    N = tracks.number
     rows = tracks.observations.copy()
     flat = np.moveaxis(rows, 2, 3).reshape(V, -1, reprojection.VALUES)
-    own, later = flat[:, :N], (changes.times @ step)[..., None]
+    own = flat[:, :N]
+    later = (changes.times @ step)[..., None]
     rays = own[..., reprojection.RAY : reprojection.RAY + 3]
     of_lens = changes.lens @ step[LENS]
     turned_lens = np.einsum('vnij,vnj->vni', changes.rows, of_lens)
@@ -352,8 +365,11 @@ def test_path_by_deviations_equals_finite_differences():
         Scene(6, sigma=1e-3, gyro=1e-3, count=100).pose()
     arguments = calls[0]
     tracks, priors, start, sigma, *_ = arguments
-    state, rng = converged(arguments, start), np.random.default_rng(1)
-    V, N, D = len(tracks.used), tracks.number, N_DEVIATIONS
+    state = converged(arguments, start)
+    rng = np.random.default_rng(1)
+    V = len(tracks.used)
+    N = tracks.number
+    D = N_DEVIATIONS
     changes = reprojection.Changes(
         np.zeros((V, N, 3, D)),
         np.zeros((V, N, D)),
@@ -385,14 +401,19 @@ def test_path_by_deviations_equals_finite_differences():
 
 def independent_residuals(x, tracks, priors, sigma, f0):
     """Residuals of the equations in the docstring of `adjustment`, without its code."""
-    V, N = len(tracks.used), tracks.number
+    V = len(tracks.used)
+    N = tracks.number
     observations = np.moveaxis(tracks.observations, 2, -1).reshape(V, -1, reprojection.VALUES)[
         :, :N
     ]
-    t, log_k, b, e = x[:3] / np.linalg.norm(x[:3]), x[3], x[4:7], x[7:10]
+    t = x[:3] / np.linalg.norm(x[:3])
+    log_k = x[3]
+    b = x[4:7]
+    e = x[7:10]
     phi = np.vstack([np.zeros(3), x[10 : 10 + 3 * V - 3].reshape(-1, 3)])
     own = x[10 + 3 * V - 3 :].reshape(N, 3)
-    T, out = tracks.duration, []
+    T = tracks.duration
+    out = []
     f = f0 + own[:, 0:1] * np.array([1.0, 0, 0]) + own[:, 1:2] * np.array([0, 1.0, 0])
     f /= np.linalg.norm(f, axis=1)[:, None]
     for v in range(V):
@@ -438,10 +459,8 @@ def test_optimum_is_that_of_an_independent_fit():
     for _ in range(6):  # far beyond the steps of an estimate
         adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9, 0.0)
     sigma = math.hypot(adjusted.sigma, adjustment.COMMON_SIGMA)
-    directions, rho = (
-        start.tracks[0, :3, :25].T,
-        start.tracks[0, reprojection.INVERSE_DISTANCE, :25],
-    )
+    directions = start.tracks[0, :3, :25].T
+    rho = start.tracks[0, reprojection.INVERSE_DISTANCE, :25]
     begin = np.concatenate(
         [
             start.t,
@@ -540,7 +559,8 @@ def test_tracks_may_be_missing_and_wrong(scene):
         points[rng.random(len(points)) < 0.1] += 15.0
         points[rng.random(len(points)) < 0.33] = np.nan
         between.append(replace(frame, points=points))
-    pose, all_tracks = scene.pose(between=between), scene.pose()
+    pose = scene.pose(between=between)
+    all_tracks = scene.pose()
     assert pose.diagnostics.frames == len(TIMES)
     sigma = np.sqrt(np.trace(all_tracks.covariance[:3, :3]))
     assert np.linalg.norm(pose.t - all_tracks.t) < 3.0 * sigma

@@ -158,16 +158,19 @@ def test_a_refusal_is_an_outcome():
 def test_a_busy_worker_costs_no_imu(monkeypatch):
     """Messages are taken in meanwhile; the oldest frames are dropped, and the latest wait."""
     held: list[Frame] = []
-    started, released = threading.Event(), threading.Event()
+    started = threading.Event()
+    released = threading.Event()
 
     def process(frame: Frame, *_: Any) -> None:
         held.append(frame)
         started.set()
         assert released.wait(100.0)
 
-    front_end, rng = FrontEnd(PARAMETERS), np.random.default_rng(0)
+    front_end = FrontEnd(PARAMETERS)
+    rng = np.random.default_rng(0)
     monkeypatch.setattr(front_end._processor, 'process', process)
-    sequencer, worker = front_end.sequencer, Worker(front_end, lambda: None, lambda _: None)
+    sequencer = front_end.sequencer
+    worker = Worker(front_end, lambda: None, lambda _: None)
     worker.start()
     for k in range(40):
         for ms in range(30 * k - 5, 30 * k + 25, 5):
@@ -389,7 +392,8 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
         elif event == 'return' and stack:
             stack.pop()[1] |= isinstance(argument, CARRIERS)
 
-    node, loop = MagicMock(), FrontEnd(parameters, keep_images=True, clock=lambda: 0)
+    node = MagicMock()
+    loop = FrontEnd(parameters, keep_images=True, clock=lambda: 0)
     node.create_subscription.return_value.handle.take_message.return_value = None
     inputs = SensorInputs(node, Intake(loop.sequencer, parameters), 'compressed', pytest.fail)
     relpose = MagicMock(

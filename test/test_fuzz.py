@@ -41,7 +41,8 @@ from rs_relpose_ros.tracking.images import ENCODINGS
 PARAMETERS = Parameters.from_mapping(
     {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
 )
-WIDTH, HEIGHT = 32, 24
+WIDTH = 32
+HEIGHT = 24
 CAMERA = RollingShutterCamera(
     width=WIDTH, height=HEIGHT, fx=30.0, fy=30.0, cx=15.5, cy=11.5, readout_time=0.02
 )
@@ -107,7 +108,8 @@ damages = st.one_of(
 
 def message_of(number: int, rng: np.random.Generator) -> tuple[Role, Any]:
     """Messages one after the other, as a camera with an IMU sends them."""
-    types, stamp_ns = build.rosbags_types, START_NS + number * INTERVAL_NS
+    types = build.rosbags_types
+    stamp_ns = START_NS + number * INTERVAL_NS
     kind = number % (IMU_PER_IMAGE + 2)
     if kind == 0:
         return Role.CAMERA_INFO, build.camera_info(
@@ -158,7 +160,9 @@ def with_damage(message: Any, damage: Any) -> Any:
 
 def receive(seed: int, plan: list[Any]) -> Counter[str]:
     """Outcomes of as many messages as there are damages in the plan."""
-    rng, now_ns, outcomes = np.random.default_rng(seed), 0, Counter[str]()
+    rng = np.random.default_rng(seed)
+    now_ns = 0
+    outcomes = Counter[str]()
     stream = [message_of(number, rng) for number in range(len(plan))]
     sequencer = Sequencer(PARAMETERS, clock=lambda: now_ns)
     intake = Intake(sequencer, PARAMETERS)

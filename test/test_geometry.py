@@ -28,7 +28,9 @@ vectors = hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 
 @given(hnp.arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), st.booleans())
 def test_products_equal_numpy(values, as_tuples):
-    a, b, M = values[0], values[1], values[2:]
+    a = values[0]
+    b = values[1]
+    M = values[2:]
     x, y = (tuple(v.tolist()) if as_tuples else v for v in (a, b))
     assert so3.dot(x, y) == pytest.approx(a @ b, rel=1e-14, abs=1e-13)
     assert so3.norm(x) == pytest.approx(np.linalg.norm(a), rel=1e-14)
@@ -60,7 +62,8 @@ def test_left_jacobian_equals_finite_differences(direction):
 
 @given(vectors, st.integers(0, 1000))
 def test_alignment_recovers_the_rotation(vector, seed):
-    R, b = Rotation.from_rotvec(vector), np.random.default_rng(seed).normal(size=(5, 3))
+    R = Rotation.from_rotvec(vector)
+    b = np.random.default_rng(seed).normal(size=(5, 3))
     np.testing.assert_allclose(so3.aligning_rotation(R.apply(b).T @ b), R.as_matrix(), atol=1e-9)
 
 
@@ -381,9 +384,12 @@ def assert_covariance_of(errors_of, factor, expected):
 def test_pose_between_later_rows():
     """Camera i at row time tau: orientation R_i Exp(w_i tau), position p_i + R_i v_i tau."""
     rng = np.random.default_rng(0)
-    state, delay = make_state(rng), 0.02
-    R1, p1 = Rotation.random(random_state=1).as_matrix(), rng.normal(size=3)
-    R2, p2 = R1 @ state.R, p1 + R1 @ state.t
+    state = make_state(rng)
+    delay = 0.02
+    R1 = Rotation.random(random_state=1).as_matrix()
+    p1 = rng.normal(size=3)
+    R2 = R1 @ state.R
+    p2 = p1 + R1 @ state.t
     later1 = R1 @ Rotation.from_rotvec(state.w1 * delay).as_matrix()
     later2 = R2 @ Rotation.from_rotvec(state.w2 * delay).as_matrix()
     baseline = later1.T @ (p2 + R2 @ state.v2 * delay - p1 - R1 @ state.v1 * delay)
@@ -399,7 +405,8 @@ def test_pose_between_later_rows():
 def test_covariance_of_the_moved_pose():
     """First-order covariance by finite differences: perturb, move, measure."""
     rng = np.random.default_rng(2)
-    state, delay = make_state(rng), 0.03
+    state = make_state(rng)
+    delay = 0.03
     factor = drawn_factor(rng, state.t, 19)
     result = moved(replace(state, covariance=factor @ factor.T), delay)
 
@@ -470,7 +477,8 @@ def test_inverse_pose_and_its_covariance():
 
 # --- illegal values
 
-NAN, STEADY = float('nan'), np.zeros((2, 3))
+NAN = float('nan')
+STEADY = np.zeros((2, 3))
 
 
 @pytest.mark.parametrize(

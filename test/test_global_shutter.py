@@ -116,7 +116,8 @@ CASES = [
 def test_a_ray_is_where_its_own_row_observed_it(lens, region, direction, stamp_row):
     """Of a ray in the middle row's frame the pixel as read, by OpenCV, SciPy and bisection."""
     middle = MiddleRow(sensor(lens, region, direction, stamp_row))
-    camera, intrinsics = middle.sensor.camera, middle.sensor.intrinsics
+    camera = middle.sensor.camera
+    intrinsics = middle.sensor.intrinsics
     found = np.concatenate([band for _, band in middle.map(FrameMotion(RATE)).bands()])
     assert found.shape == (intrinsics.image_height, intrinsics.image_width, 2)
     rng = np.random.default_rng(0)
@@ -133,11 +134,13 @@ def test_a_ray_is_where_its_own_row_observed_it(lens, region, direction, stamp_r
         rotation = Rotation.from_rotvec((delay - times)[:, None] * RATE)
         return opencv_pixels(rotation.apply(rays), camera)
 
-    low, high = np.full(len(rays), -100.0), np.full(len(rays), 600.0)
+    low = np.full(len(rays), -100.0)
+    high = np.full(len(rays), 600.0)
     for _ in range(40):
         rows = 0.5 * (low + high)
         below = rays_from(rows)[:, 1] > rows
-        low, high = np.where(below, rows, low), np.where(below, high, rows)
+        low = np.where(below, rows, low)
+        high = np.where(below, high, rows)
     as_read = intrinsics.to_image(rays_from(rows))
     # What lies within both images, where the map can be interpolated at the destination.
     size = np.array([intrinsics.image_width - 1, intrinsics.image_height - 1])
@@ -272,7 +275,8 @@ def test_border_is_replicated_or_black_and_the_mask_tells_where():
         derotated(raw(white, 'mono8'), border=border) for border in ('replicate', 'black')
     )
     assert (replicated.image().values == 255).all()
-    pixels, mask = black.image().values, black.mask()
+    pixels = black.image().values
+    mask = black.mask()
     assert mask.encoding == 'mono8'
     assert set(np.unique(mask.values)) == {0, 255}
     assert 0.02 < (mask.values == 0).mean() < 0.2
@@ -369,7 +373,8 @@ def unrolled(bag, tmp_path_factory) -> Path:
 
 
 def test_everything_else_is_copied_bit_by_bit(bag, unrolled):
-    before, after = messages_of(bag[0]), messages_of(unrolled)
+    before = messages_of(bag[0])
+    after = messages_of(unrolled)
     own = ('/camera/image_raw/compressed', '/camera/camera_info')
 
     def others(messages):
@@ -404,7 +409,8 @@ def sensor_messages_of(path: Path) -> tuple[list[Any], list[Any]]:
 
 
 def test_images_and_infos_have_the_stamp_of_the_middle_row(bag, unrolled):
-    before, after = sensor_messages_of(bag[0]), sensor_messages_of(unrolled)
+    before = sensor_messages_of(bag[0])
+    after = sensor_messages_of(unrolled)
     delay = round(4 * MS + 119.5 / 240 * 30 * MS)
     for messages in after:
         assert [stamp_ns(m.header) for m in messages] == pytest.approx(
@@ -439,7 +445,8 @@ def test_images_without_gyro_are_left_out_and_configured_intrinsics_become_a_cam
     bag, tmp_path, capsys
 ):
     path, parameters = bag
-    start, info = messages_of(path)[0].bag_time_ns, sensor_messages_of(path)[1][0]
+    start = messages_of(path)[0].bag_time_ns
+    info = sensor_messages_of(path)[1][0]
     bare = rewritten(
         path,
         tmp_path / 'bare',
@@ -477,7 +484,8 @@ def test_unknown_types_are_copied_and_other_images_of_the_same_stamps_reported(
     bag, tmp_path, caplog
 ):
     path, parameters = bag
-    payload, end_ns = b'\x00\x01\x00\x00' + bytes(range(20)), messages_of(path)[-1].bag_time_ns
+    payload = b'\x00\x01\x00\x00' + bytes(range(20))
+    end_ns = messages_of(path)[-1].bag_time_ns
 
     def add(writer):
         own = writer.add_connection(
@@ -574,7 +582,8 @@ def watched(
 ) -> list[Assessment]:
     """States of the calibration with each frame."""
     loop = unrolling_loop(parameters, offline=True, watched=lambda: is_watched)
-    intake, found = Intake(loop.sequencer, parameters), []
+    intake = Intake(loop.sequencer, parameters)
+    found = []
     with open_bag(bag) as opened:
         for role, message in incoming.sensor_messages(opened, opened.find_topics()):
             if role is Role.IMU:

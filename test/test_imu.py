@@ -72,7 +72,8 @@ def wobbling(count=100):
 
 
 def test_constant_rate_is_the_exponential_of_rate_times_time_without_its_bias():
-    rate, bias = np.array([0.2, -1.1, 0.7]), (0.01, -0.02, 0.03)
+    rate = np.array([0.2, -1.1, 0.7])
+    bias = (0.01, -0.02, 0.03)
     buffer = filled(samples(at_200_hz(), rate + bias), gyro_bias=bias)
     rotation, _ = buffer.rotation(START + 1_234_567, START + 301_234_567)
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(0.3 * rate).as_matrix(), atol=1e-12)
@@ -83,7 +84,8 @@ def test_constant_rate_is_the_exponential_of_rate_times_time_without_its_bias():
 @given(st.permutations(range(60)), st.sets(st.integers(0, 59)), st.data())
 def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
     """Samples permuted, some of them as a message for each sensor; queries in between."""
-    items, arriving = wobbling(60), []
+    items = wobbling(60)
+    arriving = []
     for k in order:
         one = items[k]
         arriving += (
@@ -91,7 +93,8 @@ def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
             if k in divided
             else [one]
         )
-    a, b = filled(items), ImuBuffer(ImuConfig())
+    a = filled(items)
+    b = ImuBuffer(ImuConfig())
     query = data.draw(st.integers(0, len(arriving) - 1))
     for k, item in enumerate(arriving):
         b.add(item)
@@ -150,7 +153,8 @@ def test_duplicates_are_reported_and_all_samples_can_be_removed():
     st.sampled_from([np.nan, np.inf, -np.inf]),
 )
 def test_nothing_of_a_broken_sample_is_kept(name, axis, value):
-    buffer, broken = ImuBuffer(ImuConfig()), np.zeros(3)
+    buffer = ImuBuffer(ImuConfig())
+    broken = np.zeros(3)
     broken[axis] = value
     with pytest.raises(InputError, match='must be finite'):
         buffer.add(replace(wobbling(1)[0], **{name: tuple(broken)}))
@@ -167,7 +171,8 @@ def test_buffer_is_bounded():
 @given(st.integers(0, 9 * PERIOD), st.integers(0, 9 * PERIOD))
 def test_borders_are_interpolated_between_the_neighbouring_samples(first, last):
     """A border on a sample is that sample, once."""
-    start, end = START + min(first, last), START + max(first, last)
+    start = START + min(first, last)
+    end = START + max(first, last)
     stamps, rates = filled(wobbling(10)).angular_velocity(start, end)
     inside = [stamp for stamp in at_200_hz(10).tolist() if start < stamp < end]
     assert stamps.tolist() == sorted({start, end, *inside})
@@ -178,7 +183,8 @@ def test_borders_are_interpolated_between_the_neighbouring_samples(first, last):
 
 def test_covariance_equals_the_spread_of_noisy_integrations():
     rng = np.random.default_rng(2)
-    stamps, rates = at_200_hz(81), 3.0 * wobble(81)
+    stamps = at_200_hz(81)
+    rates = 3.0 * wobble(81)
     integrate = integration.integrate_rotation
     expected, covariance = integrate(stamps, rates, 2e-3, 5e-3)
     errors = []
@@ -201,7 +207,8 @@ def test_integration_agrees_with_a_dense_one_by_scipy_and_with_that_of_the_rows(
     stamps = START + np.cumsum(rng.integers(2_000_000, 8_000_000, 12))
     rates = rng.normal(size=(12, 3)).cumsum(axis=0)
     motion = FrameMotion.from_gyro((stamps - stamps[0]) * 1e-9, rates)
-    expected, angles = Rotation.identity(), 0.0
+    expected = Rotation.identity()
+    angles = 0.0
     for k in range(11):
         dt = (stamps[k + 1] - stamps[k]) * 1e-9
         fractions = (np.arange(2000) + 0.5) / 2000
@@ -223,9 +230,12 @@ def test_a_frame_turns_with_the_mean_rate_of_its_exposure(exposure):
     def rate(stamps):
         return np.outer(np.sin(8e-9 * np.pi * (stamps - START)), [0.3, -0.5, 0.8])
 
-    stamps, smaller = at_200_hz(600), np.sinc(4.0 * exposure)
-    buffer, reference = filled(samples(stamps, rate(stamps))), START + 1_512_345_678
-    half, rows = to_nanoseconds(0.5 * exposure), 30_000_000
+    stamps = at_200_hz(600)
+    smaller = np.sinc(4.0 * exposure)
+    buffer = filled(samples(stamps, rate(stamps)))
+    reference = START + 1_512_345_678
+    half = to_nanoseconds(0.5 * exposure)
+    rows = 30_000_000
     blurred = frame_imu(
         buffer,
         (reference - half, reference + rows + half),
@@ -249,7 +259,8 @@ def test_a_frame_turns_with_the_mean_rate_of_its_exposure(exposure):
 
 def test_frame_imu_is_in_the_camera_frame_at_the_stamped_row():
     rate = np.array([0.0, 0.0, 0.8])
-    buffer, reference = filled(samples(at_200_hz(400), rate)), START + 1_500_000_123
+    buffer = filled(samples(at_200_hz(400), rate))
+    reference = START + 1_500_000_123
     answer = frame_imu(
         buffer, (reference, reference + 30_000_000), reference, R_CAM_IMU, reference - 66_000_000
     )
@@ -271,7 +282,8 @@ def test_frame_imu_is_in_the_camera_frame_at_the_stamped_row():
 
 BIAS = np.array([0.004, -0.006, 0.008])
 # As a MEMS of this class at 200 Hz (EuRoC's ADIS16448): 0.0024 rad/s and 0.03 m/s^2.
-RATE_NOISE, FORCE_NOISE = 0.0024, 0.03
+RATE_NOISE = 0.0024
+FORCE_NOISE = 0.03
 
 
 def rest(seconds, rng, rate=(0.0, 0.0, 0.0), force_noise=FORCE_NOISE):
@@ -348,7 +360,8 @@ def test_the_begin_of_a_motion_is_left_out():
 
 
 def test_sigma_grows_after_rest_and_a_second_rest_follows_a_drift():
-    rng, config = np.random.default_rng(3), ImuConfig()
+    rng = np.random.default_rng(3)
+    config = ImuConfig()
     tracker = BiasTracker(config)
     stamps, rates, forces = joined(rest(5.0, rng), hand(1.0, rng))
     tracker.run(stamps, rates, forces)
@@ -371,7 +384,8 @@ def test_sigma_grows_after_rest_and_a_second_rest_follows_a_drift():
 def test_the_bias_does_not_depend_on_the_portions(borders):
     rng = np.random.default_rng(5)
     stamps, rates, forces = joined(rest(4.0, rng), hand(1.0, rng), rest(3.0, rng))
-    whole, tracker = tracked(ImuConfig(), stamps, rates, forces), BiasTracker(ImuConfig())
+    whole = tracked(ImuConfig(), stamps, rates, forces)
+    tracker = BiasTracker(ImuConfig())
     for part in np.split(np.arange(len(stamps)), borders):
         tracker.run(stamps[part], rates[part], forces[part])
     portions = tracker.estimate(int(stamps[-1]))
@@ -431,7 +445,8 @@ def run(
     the world.
     """
     times = 0.005 * np.arange(int(seconds * 200))
-    R, later = orientation(times), orientation(times + 1e-4)
+    R = orientation(times)
+    later = orientation(times + 1e-4)
     rates = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ later).as_rotvec() / 1e-4 + bias
     force = np.einsum('nji,nj->ni', R, acceleration(times) + np.tile(UP, (len(times), 1)))
     force += noise * np.random.default_rng(seed).normal(size=force.shape)
@@ -476,7 +491,8 @@ def test_sigma_of_gravity_at_rest_under_acceleration_and_after_braking():
         buffer, end = run(**arguments)
         return buffer.gravity(end)
 
-    early, late = sigma(seconds=0.2), sigma(seconds=20.0)
+    early = sigma(seconds=0.2)
+    late = sigma(seconds=20.0)
     thrown = sigma(acceleration=lambda t: np.tile([0.0, 0.0, 8.0], (len(t), 1)), seconds=20.0)
     assert late.sigma < 0.5 * early.sigma
     assert thrown.sigma > 1.5 * late.sigma
@@ -566,7 +582,8 @@ def test_gravity_is_causal_and_independent_of_pruning(gravity_filter):
         if k % 300 == 299:
             pruned.prune(item.stamp_ns - 100_000_000)
     for other, at_ns in ((early, 1299 * PERIOD + 2_000_000), (pruned, 1499 * PERIOD)):
-        one, same = other.gravity(at_ns), kept.gravity(at_ns)
+        one = other.gravity(at_ns)
+        same = kept.gravity(at_ns)
         assert np.array_equal(one.direction, same.direction) and one.sigma == same.sigma
 
 
@@ -751,7 +768,9 @@ def test_the_velocities_of_the_camera_follow_from_the_baseline(walk):
         readout_time=0.03,
         reference_row='first',
     )
-    begin, duration, half = 1.1, 0.2, 0.5 * 0.03 * 479 / 480
+    begin = 1.1
+    duration = 0.2
+    half = 0.5 * 0.03 * 479 / 480
     states = walk.states([begin, begin + duration, begin + half, begin + duration + half])
     R1, R2 = states.R_world_cam[:2]
     # The acceleration within the frames is that of the IMU, not of the camera.
@@ -786,14 +805,18 @@ def test_the_velocities_of_the_camera_follow_from_the_baseline(walk):
 def test_covariance_holds_for_drawn_errors(walk):
     """Noise, biases, gravity and lever arm drawn as configured: NEES of (alpha, beta) is 6."""
     rng = np.random.default_rng(5)
-    begin, duration, rate = 0.8, 0.3, 400.0
+    begin = 0.8
+    duration = 0.3
+    rate = 400.0
     config = ImuConfig(
         accel_noise_density=0.02,
         accel_bias_sigma=0.05,
         imu_position_sigma=0.02,
         gyro_noise_density=2e-3,
     )
-    bias_sigma, tilt, length = 0.01, 0.02, 0.1
+    bias_sigma = 0.01
+    tilt = 0.02
+    length = 0.1
     times, gyro, force = samples_of(walk, begin, begin + duration, rate)
     R1, R2 = walk.states([begin, begin + duration]).R_world_cam
     gravity = R1.T @ GRAVITY
@@ -803,7 +826,8 @@ def test_covariance_holds_for_drawn_errors(walk):
     )
 
     def arm_term(arm):  # of the relation to the camera, in (alpha', beta')
-        w1, w2 = np.cross(gyro[0], arm), np.cross(gyro[-1], arm)
+        w1 = np.cross(gyro[0], arm)
+        w2 = np.cross(gyro[-1], arm)
         return np.concatenate([duration * w1 + arm - R1.T @ R2 @ arm, w1 - R1.T @ R2 @ w2])
 
     exact = integration.preintegrate(times, gyro, force, gravity, spread, ARM, config, bias_sigma)
@@ -835,7 +859,8 @@ def test_covariance_holds_for_drawn_errors(walk):
             + arm_term(config.imu_position_sigma * rng.normal(size=3))
         )
     errors = np.array(errors)
-    sampled, sigma = np.cov(errors.T), np.sqrt(np.diag(exact.covariance))
+    sampled = np.cov(errors.T)
+    sigma = np.sqrt(np.diag(exact.covariance))
     np.testing.assert_allclose(
         sampled / np.outer(sigma, sigma), exact.covariance / np.outer(sigma, sigma), atol=0.15
     )
@@ -845,7 +870,9 @@ def test_covariance_holds_for_drawn_errors(walk):
 
 def test_shifted_rows(walk):
     """Between rows 12 ms later: as integrated there."""
-    begin, duration, delay = 0.7, 0.2, 0.012
+    begin = 0.7
+    duration = 0.2
+    delay = 0.012
     _, velocity, (R1, M1, *_) = imu_states(
         walk, [begin, begin + delay, begin + duration, begin + duration + delay]
     )
@@ -875,12 +902,16 @@ READOUT_NS = 20_000_000
 def motion_of_frames(walk, change=lambda time, force: force, own_topic=False):
     """From the first of FRAMES to the last; `own_topic`: the accelerometer in other messages."""
     config = ImuConfig(imu_position=tuple(ARM), track_gyro_bias=False)
-    buffer, times, late_ns = ImuBuffer(config), np.arange(-0.3, 1.45, 1.0 / 200.0), 1_700_000
-    model, rng = ImuModel(R_CAM_IMU, ARM), np.random.default_rng(0)
+    buffer = ImuBuffer(config)
+    times = np.arange(-0.3, 1.45, 1.0 / 200.0)
+    late_ns = 1_700_000
+    model = ImuModel(R_CAM_IMU, ARM)
+    rng = np.random.default_rng(0)
     gyro, _ = model.measure(walk.states(times), rng)
     _, force = model.measure(walk.states(times + own_topic * late_ns * 1e-9), rng)
     for k, time in enumerate(times):
-        stamp_ns, specific = START + round(time * 1e9), change(time, force[k])
+        stamp_ns = START + round(time * 1e9)
+        specific = change(time, force[k])
         specific = None if specific is None else tuple(specific)
         if own_topic:
             buffer.add(ImuSample(stamp_ns + late_ns, None, specific))

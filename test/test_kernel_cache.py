@@ -49,7 +49,8 @@ result = [outer(3.0), inner(3.0)]
 print(json.dumps([*result, *(sum(sum(getattr(k.stats, kind).values()) for k in (inner, outer))
                              for kind in ('cache_hits', 'cache_misses'))]))
 """
-HITS, COMPILED = [7.0, 6.0, 2, 0], [7.0, 6.0, 0, 2]
+HITS = [7.0, 6.0, 2, 0]
+COMPILED = [7.0, 6.0, 0, 2]
 
 
 @pytest.fixture(scope='module')
@@ -258,7 +259,8 @@ def test_every_import_of_a_kernels_module_counts(monkeypatch):
         name for name, path in MODULES.items() if 'rs_relpose_ros.jit import' in path.read_text()
     ]
     assert len(with_kernels) > 20
-    read_bytes, read = Path.read_bytes, set()
+    read_bytes = Path.read_bytes
+    read = set()
     monkeypatch.setattr(Path, 'read_bytes', lambda path: (read.add(path), read_bytes(path))[1])
     for module in with_kernels:
         __import__(module)

@@ -135,7 +135,8 @@ def test_16_bits_are_scaled_to_their_content(low, high):
 
 
 def test_the_range_of_16_bits_is_kept_while_the_content_fits():
-    levels, pixels = GrayLevels(), texture(1000, 3000)
+    levels = GrayLevels()
+    pixels = texture(1000, 3000)
     first = levels.gray(pixels)
     # Automatic exposure, a little darker: the same range, so the image is darker, too.
     darker = levels.gray((pixels * 0.9).astype(np.uint16))
@@ -149,7 +150,9 @@ def test_the_range_of_16_bits_is_kept_while_the_content_fits():
 
 @build.both_types
 def test_messages_of_16_bits_use_the_given_range(types):
-    levels, bright, dark = GrayLevels(), texture(0, 4000), texture(0, 3000)
+    levels = GrayLevels()
+    bright = texture(0, 4000)
+    dark = texture(0, 3000)
     first, second = (
         incoming.image_from_message(
             build.image(types, 160, 120, 'mono16', pixels.astype('<u2').tobytes(), step=320)
@@ -635,7 +638,8 @@ def used(
     values: list[tuple[float, float, float]], step_ms: int = 5, longest: float = 0.025
 ) -> list[str]:
     """For each sample 'used', '' if it repeats the last one, or the error."""
-    gyro, out = StuckGyro(longest), []
+    gyro = StuckGyro(longest)
+    out = []
     for k, value in enumerate(values):
         try:
             repeats = gyro.repeats(ImuSample(k * step_ms * 10**6, value, None))
@@ -930,8 +934,10 @@ def test_pair_messages(types):
             'velocity': 'camera',
             'pairs': '',
         }.get(topic, 'camera_reference')
-    pose, rotation = messages['relative_pose'].pose, messages['relative_rotation']
-    q, t = pose.pose.orientation, pose.pose.position
+    pose = messages['relative_pose'].pose
+    rotation = messages['relative_rotation']
+    q = pose.pose.orientation
+    t = pose.pose.position
     assert q.w >= 0.0
     np.testing.assert_allclose(
         Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), result.pose.R, atol=1e-12
@@ -942,7 +948,8 @@ def test_pair_messages(types):
         np.reshape(pose.covariance, (6, 6)), result.pose.covariance, rtol=1e-9
     )
     twist = messages['velocity'].twist
-    linear, angular = twist.twist.linear, twist.twist.angular
+    linear = twist.twist.linear
+    angular = twist.twist.angular
     assert [linear.x, linear.y, linear.z] == result.pose.linear_velocity2.tolist()
     assert [angular.x, angular.y, angular.z] == result.pose.angular_velocity2.tolist()
     assert (rotation.orientation, rotation.angular_velocity) == (q, angular)

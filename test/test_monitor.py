@@ -61,9 +61,12 @@ from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonit
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 
-AXES, BIAS = LIVE.part('axes'), LIVE.part('gyro_bias')
-OFFSET, READOUT = LIVE.index('time_offset'), LIVE.index('readout_time')
-SCALE, SKEW = LIVE.part('gyro_scale'), LIVE.part('gyro_skew')
+AXES = LIVE.part('axes')
+BIAS = LIVE.part('gyro_bias')
+OFFSET = LIVE.index('time_offset')
+READOUT = LIVE.index('readout_time')
+SCALE = LIVE.part('gyro_scale')
+SKEW = LIVE.part('gyro_skew')
 FOCAL, ASPECT = map(LIVE.index, ('focal_log', 'aspect'))
 DISTORTION = LIVE.part('distortion')
 CENTER = LIVE.part('principal_point')
@@ -117,7 +120,8 @@ def deviation(**values):
 # -- exact pairs: an image is exposed by search, without derivatives of the monitor -------------
 
 # A camera that shakes while it flies past points; positions in metres.
-RNG, TIMES = np.random.default_rng(0), np.arange(-1.0, 6.0, 0.4)
+RNG = np.random.default_rng(0)
+TIMES = np.arange(-1.0, 6.0, 0.4)
 ORIENTATION = RotationSpline(TIMES, Rotation.from_rotvec(0.12 * RNG.normal(size=(len(TIMES), 3))))
 VELOCITY = np.array([0.9, 0.3, 0.4])
 POINTS = RNG.uniform([-4, -3, 4], [9, 4, 14], (900, 3))
@@ -294,10 +298,12 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
         return np.concatenate([pose.t - pair.t, turn])
 
     for start in (0.4, 1.2, 2.0):
-        right, wrong = estimated(start, NONE), estimated(start, -c)
+        right = estimated(start, NONE)
+        wrong = estimated(start, -c)
         pair, pose = right
         configured = pair_information(replace(pair, R=pose.R, t=pose.t), NONE, NONE)
-        moved, expected = off(*wrong) - off(*right), configured.pose_by_deviation @ c
+        moved = off(*wrong) - off(*right)
+        expected = configured.pose_by_deviation @ c
         apart = np.linalg.norm(moved[3:] - expected[3:])
         assert apart < 0.45 * np.linalg.norm(moved[3:]) + 1e-4
         sigma = math.sqrt(np.trace(pose.covariance[:3, :3]))
@@ -360,14 +366,16 @@ MOVING = {
 
 def estimate_of_all_frames(start, c, number=5):
     """Pose of frames 0.1 s apart whose images have the deviations c; its error (6,)."""
-    stamps, noise = start + 0.1 * np.arange(number), np.random.default_rng(3)
+    stamps = start + 0.1 * np.arange(number)
+    noise = np.random.default_rng(3)
     noise = 0.1 * noise.normal(size=(number, len(POINTS), 2))
     true = deviating(CAMERA, c)
     places = [exposed(true, stamp + c[OFFSET]) for stamp in stamps]
     seen = np.flatnonzero(np.all([one[1] for one in places], axis=0))[:150]
     points = np.array([one[0][seen] for one in places]) + noise[:, seen]
     earliest, latest = CAMERA.row_time_span
-    motions, slices = [], []
+    motions = []
+    slices = []
     for stamp in stamps:
         times, rates = gyro(stamp + earliest - 1e-3, stamp + latest + 1e-3, c)
         motions.append(FrameMotion.from_gyro(1e-9 * times - stamp, rates))
@@ -409,7 +417,8 @@ def test_a_deviation_shifts_the_pose_of_all_frames_by_its_derivative(name):
         moved = wrong - right
         along = np.pad(np.outer(pose.t, pose.t), (0, 3))
         root = np.linalg.cholesky(np.linalg.inv(pose.covariance + along)).T
-        apart, size = np.linalg.norm(root @ (moved - expected)), np.linalg.norm(root @ moved)
+        apart = np.linalg.norm(root @ (moved - expected))
+        size = np.linalg.norm(root @ moved)
         assert apart < 0.25 * size + 0.1, (apart, size)
 
 
@@ -450,7 +459,8 @@ def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estima
                 for moved in (estimated(right=2.0), estimated(down=2.0))
             ]
         )
-        added, expected = doubtful - exact, shifts.T @ shifts
+        added = doubtful - exact
+        expected = shifts.T @ shifts
         # Of t, which other priors of the velocities move otherwise, within its sigma.
         np.testing.assert_allclose(
             added[3:, 3:], expected[3:, 3:], atol=0.2 * np.trace(expected[3:, 3:])
@@ -518,7 +528,8 @@ def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
 
 def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0), noise=1e-3):
     """Images rotate by `scale` times Q times the gyro's rotation, about axes by `weights`."""
-    rng, sums = np.random.default_rng(seed), RotationSums()
+    rng = np.random.default_rng(seed)
+    sums = RotationSums()
     for k in range(count):
         by_gyro = size * rng.normal(size=3) * weights
         sums.add(
@@ -566,7 +577,8 @@ def test_images_on_their_side_are_offered_as_reason(axis, angle, named):
 
 
 def test_a_gross_error_persists_until_it_is_contradicted():
-    degrees, unknown = rotations(np.eye(3), math.radians(1.0), size=3.0).compared(), None
+    degrees = rotations(np.eye(3), math.radians(1.0), size=3.0).compared()
+    unknown = None
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()
     found = ()
     for compared, named in (
@@ -597,7 +609,8 @@ def test_clocks_that_differ_by_seconds_are_named(ahead, message):
 
 
 def test_an_accelerometer_in_g_is_named_after_a_second():
-    sums, fault = AccelerationSums(), force_fault(np.array([[0.0, 0.0, 1.0]] * 9))
+    sums = AccelerationSums()
+    fault = force_fault(np.array([[0.0, 0.0, 1.0]] * 9))
     for stamp_ns, reason, named in (
         (0, fault, False),
         (600 * MS, fault, False),
@@ -630,7 +643,9 @@ def test_rotated_axes_and_another_unit_are_found(rotvec, scale, size):
 @pytest.mark.parametrize('rotating', [True, False])
 def test_a_gyro_with_little_more_than_its_bias(rotating):
     """Rates 57 times too small are found beneath a bias; a camera on a rail rotates as little."""
-    rng, sums, stamp_ns = np.random.default_rng(2), RotationSums(), 0
+    rng = np.random.default_rng(2)
+    sums = RotationSums()
+    stamp_ns = 0
     for interval in 0.033 * rng.integers(1, 4, 60):
         stamp_ns += round(1e9 * interval)
         by_images = 0.4 * interval * rng.normal(size=3)
@@ -647,7 +662,8 @@ def test_clocks_that_are_far_apart_are_found_by_the_rotations(offset):
     """Images and gyro would be independent as configured; a wrong gyro agrees at no offset."""
     rng = np.random.default_rng(11)
     times = np.arange(0.0, 8.0, 0.1)
-    frequencies, phases = rng.uniform(0.4, 2.6, size=(3, 6)), rng.uniform(0.0, 6.3, size=(3, 6))
+    frequencies = rng.uniform(0.4, 2.6, size=(3, 6))
+    phases = rng.uniform(0.0, 6.3, size=(3, 6))
 
     def angles(at):
         return 0.08 * np.sin(6.3 * frequencies * at + phases).sum(axis=1)
@@ -676,7 +692,8 @@ def test_clocks_that_are_far_apart_are_found_by_the_rotations(offset):
 @pytest.mark.parametrize('turned', [False, True])
 def test_neither_axes_nor_clocks_are_named_where_both_explain_the_rotations(turned):
     """Two axes swing once a stride and one twice: half a stride later two have changed sign."""
-    rng, stride = np.random.default_rng(12), 0.9
+    rng = np.random.default_rng(12)
+    stride = 0.9
     turn, offset = (np.diag([-1.0, 1.0, -1.0]), 0.0) if turned else (np.eye(3), 0.5 * stride)
 
     def angles(at):
@@ -696,7 +713,8 @@ def test_neither_axes_nor_clocks_are_named_where_both_explain_the_rotations(turn
 
 def test_a_steady_translation_is_no_rotation():
     """It is similar to a constant rate of the images, without information on the axes."""
-    rng, sums = np.random.default_rng(5), RotationSums()
+    rng = np.random.default_rng(5)
+    sums = RotationSums()
     steady, drift = np.array([0.0, 0.15, 0.0]), np.array([0.0, -0.25, 0.07])  # [rad/s]
     for k, spread in enumerate([0.01] * 12 + [1e-4] * 40):  # it sways, then moves steadily
         by_gyro = 0.1 * steady + spread * rng.normal(size=3)
@@ -708,7 +726,8 @@ def test_a_steady_translation_is_no_rotation():
 @pytest.mark.parametrize('still', [True, False])
 def test_a_constant_rate(noise, still):
     """A turntable is consistent; still images of a rotating gyro are not of its camera."""
-    rng, sums = np.random.default_rng(5), RotationSums()
+    rng = np.random.default_rng(5)
+    sums = RotationSums()
     steady = 0.125 * np.array([0.0, 0.5, 0.0])  # in 1/8 s, exact in binary
     for k in range(60):
         sums.add(
@@ -725,7 +744,8 @@ def test_a_constant_rate(noise, still):
 @pytest.mark.parametrize('axis', range(3))
 def test_left_handed_axes_are_no_rotation(axis):
     """One sign of the IMU's own axes, though translation hides a third of the rotation."""
-    signs, R = np.ones(3), R_CAM_IMU.as_matrix()
+    signs = np.ones(3)
+    R = R_CAM_IMU.as_matrix()
     signs[axis] = -1.0
     sums = rotations(R @ np.diag(signs) @ R.T, count=80, noise=0.035)
     assert sums.compared().is_left_handed
@@ -894,7 +914,8 @@ def test_distortion_of_a_lens_that_is_given_without_is_named_by_pairs():
     given = replace(CAMERA, distortion=())
     off = np.array([0.163, -0.520, 0.474])
     c = deviation(distortion=np.linalg.solve(independent_shapes(corner_radius(given)), off))
-    rng, sums = np.random.default_rng(3), Posterior()
+    rng = np.random.default_rng(3)
+    sums = Posterior()
     for k in range(12):
         pair = pair_data(0.4 * k, 0.4 * k + 0.3, c, given)
         noise = 0.3 * rng.normal(size=(2, *pair.points1.shape))
@@ -931,7 +952,8 @@ def test_squeezed_images_are_named_with_both_focal_lengths(wrong, named):
 @pytest.mark.parametrize('squeeze', [0.95, 1.05, 1.0])
 def test_squeezed_images_are_named_by_pairs(squeeze):
     c = deviation(focal_log=math.log(squeeze), aspect=-math.log(squeeze))
-    rng, sums = np.random.default_rng(4), Posterior()
+    rng = np.random.default_rng(4)
+    sums = Posterior()
     for k in range(12):
         pair = pair_data(0.4 * k, 0.4 * k + 0.3, c)
         noise = 0.3 * rng.normal(size=(2, *pair.points1.shape))
@@ -1220,7 +1242,8 @@ def test_tracked_values_are_those_of_the_parameters(direction, sign):
 
 
 def test_pairs_that_contradict_the_accelerometer():
-    sums, stamps = AccelerationSums(), itertools.count(0, 1000 * MS)
+    sums = AccelerationSums()
+    stamps = itertools.count(0, 1000 * MS)
     # Number of pairs of such evidence, and a part of the fix then; None: no finding yet.
     for pairs, evidence, fix in (
         (3, (-50.0, -80.0), None),  # one pair does not decide, however strong
@@ -1271,7 +1294,8 @@ def imu_with(axes=UNCHANGED, gyro=1.0, late=0.0, force=UNCHANGED):
     """
 
     def changed(sample):
-        rate, specific = sample.angular_velocity, sample.linear_acceleration
+        rate = sample.angular_velocity
+        specific = sample.linear_acceleration
         return replace(
             sample,
             stamp_ns=sample.stamp_ns + round(1e9 * late),
@@ -1372,7 +1396,8 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
             case.estimated, abs=4.0 * fault.sigma + case.tolerance
         )
     for k, result in enumerate(results):
-        state, pose = result.health.state, result.pose
+        state = result.health.state
+        pose = result.pose
         if state is FindingState.WRONG:
             assert not pose
             assert line(result.health.faults[0]) == pose.reason or (
@@ -1413,7 +1438,8 @@ def test_a_scale_of_the_accelerometer_is_in_the_doubt_of_baselines_or_named(
 
 def test_a_pair_is_published_before_its_assessment(bundled_bag, monkeypatch):
     """Its health is that of the pairs before; the one that reveals a fault has a pose."""
-    assessed, assess = [ConsistencyMonitor().health], ConsistencyMonitor.assess
+    assessed = [ConsistencyMonitor().health]
+    assess = ConsistencyMonitor.assess
 
     def noted(self):
         assess(self)
@@ -1497,7 +1523,9 @@ def estimated_pairs(c, count):
 )
 def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
     """From the first pair on, with the configured rotation of the gyro, and without a fault."""
-    monitor, alone, within = ConsistencyMonitor(), 0.0, 0.0
+    monitor = ConsistencyMonitor()
+    alone = 0.0
+    within = 0.0
     for stamp_ns, pair, pose in estimated_pairs(c, 6):
         off = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
         alone = max(alone, off @ np.linalg.solve(pose.covariance[3:, 3:], off))
@@ -1513,7 +1541,8 @@ def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
 
 def agreeing_pairs(scatter, count=60, seed=0, frames=5, gyro_square=0.0):
     """Poses of a straight motion, directions at the ends off by `scatter` times their sigma."""
-    rng, sigma = np.random.default_rng(seed), 0.01
+    rng = np.random.default_rng(seed)
+    sigma = 0.01
     for _ in range(count):
         ends = np.array([0.0, 0.0, 4.0]) + [1.0, 1.0, 0.0] * (
             4.0 * scatter * sigma * rng.normal(size=(2, 3))
@@ -1537,7 +1566,8 @@ def factors(poses, gap=0, doubt=0.0):
 
     `doubt`: variance that the monitor adds about one axis.
     """
-    agreement, found = Agreement(), []
+    agreement = Agreement()
+    found = []
     for k, pose in enumerate(poses):
         first = k * (100 + gap)
         assessed = replace(pose, covariance=pose.covariance + np.diag([0, 0, 0, doubt, 0, 0]))
@@ -1646,7 +1676,8 @@ def test_live_and_replay_agree_while_tracking(bundled_bag):
     )
     front_end = FrontEnd(read_parameters(bundled_bag.with_name('hand_held.yaml'), settings))
     sequencer = front_end.sequencer
-    processed, failed = [], []
+    processed = []
+    failed = []
     worker = Worker(
         front_end,
         lambda: None,
@@ -1654,7 +1685,9 @@ def test_live_and_replay_agree_while_tracking(bundled_bag):
     )
     worker.start()
     assert worker.warm.wait(60.0)
-    intake, rng, images = Intake(sequencer), np.random.default_rng(5), 0
+    intake = Intake(sequencer)
+    rng = np.random.default_rng(5)
+    images = 0
     with open_bag(bundled_bag) as bag:
         for role, message in sensor_messages(bag, bag.find_topics()):
             if role is not Role.IMAGE:

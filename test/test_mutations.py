@@ -102,7 +102,8 @@ def with_fields(messages: Messages, rng: np.random.Generator) -> Messages:
 
 def with_stamps(messages: Messages, rng: np.random.Generator) -> Messages:
     """Header stamps jump, repeat, jitter, overflow or begin in another year."""
-    way, numbers = int(rng.integers(7)), chosen(messages, rng)
+    way = int(rng.integers(7))
+    numbers = chosen(messages, rng)
     seconds = float(rng.choice([0.001, 0.02, 0.4, 3.0, 50.0, 4294.967296, 1.7e9]))
     for place, number in enumerate(numbers):
         raw = messages[number]
@@ -123,7 +124,8 @@ def with_stamps(messages: Messages, rng: np.random.Generator) -> Messages:
             now,
         )[way]
         new = min(max(new, 0), (2**31 - 1) * NANOSECONDS)
-        stamp.sec, stamp.nanosec = new // NANOSECONDS, new % NANOSECONDS
+        stamp.sec = new // NANOSECONDS
+        stamp.nanosec = new % NANOSECONDS
         if way == 6:
             stamp.nanosec = now % 2**32
         messages[number] = encoded(raw, message)
@@ -133,7 +135,8 @@ def with_stamps(messages: Messages, rng: np.random.Generator) -> Messages:
 def swapped(messages: Messages, rng: np.random.Generator) -> Messages:
     """Contents of messages of one topic, or of two, are exchanged."""
     first, second = (int(number) for number in rng.integers(len(messages), size=2))
-    one, other = messages[first], messages[second]
+    one = messages[first]
+    other = messages[second]
     messages[first] = one._replace(data=other.data)
     messages[second] = other._replace(data=one.data)
     return messages
@@ -208,7 +211,8 @@ def faults(
     capsys: pytest.CaptureFixture[str], walk: Any, folder: Path, seeds: range
 ) -> tuple[list[str], Counter[Any]]:
     messages, topics, parameters = walk
-    found, codes = [], Counter[Any]()
+    found = []
+    codes = Counter[Any]()
     given = ('--params', parameters)
     for seed in seeds:
         bag = write(mutated(messages, seed), topics, folder / 'bag')

@@ -45,7 +45,10 @@ def cropped(message: Any) -> Any:
     """Of the image, and of the CameraInfo alike."""
     if isinstance(message, CameraInfo):
         roi = message.roi
-        roi.x_offset, roi.y_offset, roi.width, roi.height = 40, 100, 600, 380
+        roi.x_offset = 40
+        roi.y_offset = 100
+        roi.width = 600
+        roi.height = 380
         return message
     return faults.gray_image(message.header, faults.pixels_of(message)[100:, 40:])
 
@@ -222,7 +225,8 @@ def wrong(
     message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int, truth: TrueTrajectory
 ) -> str:
     """How a pose is wrong: by more than its covariance claims, and enough to do harm."""
-    position, q = message.pose.pose.position, message.pose.pose.orientation
+    position = message.pose.pose.position
+    q = message.pose.pose.orientation
     errors = truth.errors(
         Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
         np.array([position.x, position.y, position.z]),
@@ -264,11 +268,14 @@ def test_no_pose_comes_without_a_calibration(session):
 
 
 def test_no_wrong_pose_is_published(session, truth):
-    stream, checked, found = session.stream, 0, []
+    stream = session.stream
+    checked = 0
+    found = []
     for message in session.poses:
         stamp = faults.stamp_of(message)
         reference = session.references[stamp]
-        begin_ns, end_ns = stream.taken_at[reference], stream.taken_at[stamp]
+        begin_ns = stream.taken_at[reference]
+        end_ns = stream.taken_at[stamp]
         # A stamp of two images identifies none.
         if begin_ns is None or end_ns is None:
             continue

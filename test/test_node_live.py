@@ -100,7 +100,8 @@ def test_poses_are_those_of_the_truth(run, bundled_bag):
     for message, reference in zip(
         run.messages['relative_pose'], run.messages['reference'], strict=True
     ):
-        position, q = message.pose.pose.position, message.pose.pose.orientation
+        position = message.pose.pose.position
+        q = message.pose.pose.orientation
         errors.append(
             truth.errors(
                 Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
@@ -290,12 +291,16 @@ def test_odometry_in_the_axes_of_px4():
     spec = importlib.util.spec_from_file_location('px4_odometry', PX4)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    rng, message = np.random.default_rng(0), Odometry()
+    rng = np.random.default_rng(0)
+    message = Odometry()
     root = rng.normal(size=(6, 6))
-    message.header.stamp.sec, message.header.stamp.nanosec = 12, 345_678_901
-    pose, twist = message.pose.pose, message.twist.twist
+    message.header.stamp.sec = 12
+    message.header.stamp.nanosec = 345_678_901
+    pose = message.pose.pose
+    twist = message.twist.twist
     message.pose.covariance = (root @ root.T).ravel()
-    R, (p, v, w) = Rotation.random(random_state=1), rng.normal(size=(3, 3))
+    R = Rotation.random(random_state=1)
+    (p, v, w) = rng.normal(size=(3, 3))
     for vector, values in (
         (pose.position, p),
         (pose.orientation, R.as_quat()),
@@ -341,7 +346,8 @@ def test_frame_timings_name_what_cannot_be_written(tmp_path):
 def test_a_run_and_its_report(tmp_path, ros_domain_id, monkeypatch):
     """Three seconds of small images, as any cell is run."""
     monkeypatch.setattr(live_clip, 'PERIOD', 2.0)
-    cell, seconds = live.LiveCell(320, 240, 'bgr8', 200), []
+    cell = live.LiveCell(320, 240, 'bgr8', 200)
+    seconds = []
     clip = live_clip.prepare_clip(tmp_path, cell.width, cell.height)
     found, over_time = live.run_cell(
         cell,

@@ -518,7 +518,8 @@ def node(module_ros_domain_id: int) -> Iterator[Node]:
 
 def test_a_task_that_nothing_announces_is_run(node):
     """Its guard was read while rclpy looked for other work: a node would not end."""
-    kept, done = KeptWaitSet(context=node.context), threading.Event()
+    kept = KeptWaitSet(context=node.context)
+    done = threading.Event()
     kept.add_node(node)
 
     def add() -> None:
@@ -529,7 +530,8 @@ def test_a_task_that_nothing_announces_is_run(node):
         while not done.is_set():
             kept.spin_once()
 
-    timer, thread = node.create_timer(0.01, add), threading.Thread(target=spin)
+    timer = node.create_timer(0.01, add)
+    thread = threading.Thread(target=spin)
     thread.start()
     try:
         assert done.wait(20.0)
@@ -637,7 +639,8 @@ def assert_refused(node: Node, reason: str, *parameters: Parameter) -> None:
 
 @pytest.mark.parametrize('name', DECLARATIONS)
 def test_an_illegal_value_is_refused_with_its_reason(node, parameters, name):
-    before, legal = len(CHANGES), Parameter('threshold', value=1.5)
+    before = len(CHANGES)
+    legal = Parameter('threshold', value=1.5)
     for value in illegal_values(DECLARATIONS[name]):
         assert_refused(node, name, legal, Parameter(name, value=value))
     if DEFAULTS[name] is not None:
@@ -656,7 +659,8 @@ def test_the_parameters_of_the_construction_are_read_only(node, parameters, name
 
 @pytest.mark.parametrize('name', LIVE)
 def test_a_live_parameter_is_passed_on(node, parameters, name):
-    value, before = other_value(name, DECLARATIONS[name]), len(CHANGES)
+    value = other_value(name, DECLARATIONS[name])
+    before = len(CHANGES)
     assert value != DEFAULTS[name]
     [result] = node.set_parameters(
         [Parameter(name, value=list(value) if isinstance(value, tuple) else value)]

@@ -313,8 +313,10 @@ def test_a_camera_without_camera_info_gives_poses_and_transforms(
             'camera_optical_frame',
             'camera_optical_frame_reference',
         )
-        t, q = message.pose.pose.position, message.pose.pose.orientation
-        found, r = sent.transform.translation, sent.transform.rotation
+        t = message.pose.pose.position
+        q = message.pose.pose.orientation
+        found = sent.transform.translation
+        r = sent.transform.rotation
         inverse = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
         np.testing.assert_allclose([found.x, found.y, found.z], -inverse.apply([t.x, t.y, t.z]))
         np.testing.assert_allclose(
@@ -339,7 +341,8 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
             parameters={'image_transport': 'raw', 'use_sim_time': True},
         ) as node:
             node.wait_for('set image_transport:=compressed')
-            clock, stands = graph.publisher(Clock, '/clock'), Clock(clock=Time(sec=100))
+            clock = graph.publisher(Clock, '/clock')
+            stands = Clock(clock=Time(sec=100))
             clock.publish(stands)
             faults.play(faults.drivers(graph, Image, Imu), messages)
             wait_until(lambda: len(poses) >= 3, 'three poses', node)
@@ -384,7 +387,8 @@ def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bun
         )
         assert node.signal(signal.SIGTERM)[0] == 0
         [line] = [line for line in node.output.splitlines() if 'ERROR' in line]
-    values, text = diagnostic_values(report), 'time_offset is wrong: '
+    values = diagnostic_values(report)
+    text = 'time_offset is wrong: '
     assert report.status[0].level == ERROR
     assert report.status[0].message.startswith(text)
     assert (values['state'], values['last_reason_no_pose'].split(':')[0]) == (

@@ -66,7 +66,8 @@ ROW = 0.015  # [s] from the stamped to the middle row
 SIGMA_R, SIGMA_T = 2e-4, 8e-3  # [rad]
 QUAT = (0.502457, -0.504378, 0.507698, 0.485163)
 LEVER = (0.03, 0.01, -0.02)
-GYRO_BIAS, ACCEL_BIAS = (0.011, -0.007, 0.005), (0.06, -0.04, 0.05)
+GYRO_BIAS = (0.011, -0.007, 0.005)
+ACCEL_BIAS = (0.06, -0.04, 0.05)
 PARAMETERS = Parameters.from_mapping(
     {
         'quat_cam_imu_xyzw': QUAT,
@@ -120,7 +121,8 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
         way = R1.T @ (middle.position[k + 1] - middle.position[k])
         error = rng.multivariate_normal(np.zeros(5), noise)
         R = exp_so3(-error[:3]) @ R1.T @ R2
-        baseline, status = float(np.linalg.norm(way)), 'OK'
+        baseline = float(np.linalg.norm(way))
+        status = 'OK'
         if baseline > 0.01:
             t = way / baseline
             t = t - tangent_basis(t) @ error[3:]
@@ -130,7 +132,8 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
                 ROW, R, t / np.linalg.norm(t), np.tile(t / INTERVAL, 2), information, np.zeros(11)
             )
         else:
-            status, baseline = 'PURE_ROTATION', math.nan
+            status = 'PURE_ROTATION'
+            baseline = math.nan
             images = ImageInformation(
                 ROW,
                 R,
@@ -245,7 +248,8 @@ def test_derivatives_of_deviations_are_those_of_finite_differences():
         ]
         R1, R2 = (R_b @ C_true.T for R_b in R_read)
         q = R1.T @ (at[1] + R_read[1] @ arm - at[0] - R_read[0] @ arm)
-        R, t = np.ascontiguousarray(R1.T @ R2), q / np.linalg.norm(q)
+        R = np.ascontiguousarray(R1.T @ R2)
+        t = q / np.linalg.norm(q)
         velocities = rng.normal(size=6)
         exact, _ = deviations(*bodies, mount, Measured(R, t, velocities))
         expected = np.concatenate([R1.T @ v for v in moving]) / np.linalg.norm(q) - velocities
@@ -422,7 +426,8 @@ def test_order_of_messages_does_not_matter(walked, tracked):
             for k, pair in enumerate(walked.pairs)
         ]
     )
-    estimator, out = OdometryEstimator(PARAMETERS), []
+    estimator = OdometryEstimator(PARAMETERS)
+    out = []
     for _, kind, _, message in events:
         (estimator.add_pair if kind else estimator.add_imu)(message)
         out += estimator.take()
@@ -510,7 +515,8 @@ def test_the_base_starts_at_the_origin_with_x_forward(of_base):
 def test_stamps_follow_the_offset_that_the_graph_has_learned(of_base):
     estimator = of_base[0]
     publication = estimator._publication(estimator._run)
-    unknown, state = estimator._doubts, estimator._run.graph.newest
+    unknown = estimator._doubts
+    state = estimator._run.graph.newest
     doubts = np.zeros(unknown.size)
     before = publication.state(replace(state, doubts=doubts), np.zeros(3), Stamp(0, 0, 0, 0))
     offset = IMAGES.part('time_offset').start
@@ -534,7 +540,8 @@ def test_a_covariance_of_uncertain_size_holds_its_promise(pairs):
 def test_covariances_of_the_base_are_those_of_samples(of_base):
     """The body's state is drawn from its covariance; that of the gyro's noise is left out."""
     estimator = of_base[0]
-    run_, rate = estimator._run, np.array((0.5, -0.8, 0.3))
+    run_ = estimator._run
+    rate = np.array((0.5, -0.8, 0.3))
     noiseless = OdometryEstimator(OF_BASE.updated({'gyro_noise_density': 1e-7}))
     noiseless._first_R = estimator._first_R
     state = run_.graph.newest
@@ -549,7 +556,8 @@ def test_covariances_of_the_base_are_those_of_samples(of_base):
         return publication.state(state, rate, Stamp(0, 0, 0, 0))
 
     published = odometry(replace(state, covariance=P))
-    poses, twists = [], []
+    poses = []
+    twists = []
     for d in np.random.default_rng(5).multivariate_normal(np.zeros(len(P)), P, 4000):
         one = odometry(
             replace(
@@ -650,7 +658,8 @@ def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
 
 def test_pairs_that_are_wrong_together_count_by_their_innovations():
     """Directions that are off by 9 deg for 2.5 s: chi squared of the position."""
-    given, squares = walk('walk:7', 7.0, imu_rate=100.0), []
+    given = walk('walk:7', 7.0, imu_rate=100.0)
+    squares = []
     turn = exp_so3(np.array([0.0, 0.0, 0.16]))
     _, out = run(
         given,
@@ -754,7 +763,9 @@ def test_an_unknown_lever_arm_is_estimated(walked, tracked):
 def test_the_published_path_is_continuous_and_increasing(walked, delay):
     """Pairs are late by `delay`; without it, keyframes are newer than the last state."""
     estimator = OdometryEstimator(PARAMETERS)
-    continuous, published, waiting = ContinuousPath(estimator.propagated), [], list(walked.pairs)
+    continuous = ContinuousPath(estimator.propagated)
+    published = []
+    waiting = list(walked.pairs)
     for k, sample in enumerate(samples_of(walked, -1.0, 8.0)):
         estimator.add_imu(sample)
         while waiting and later(waiting[0], SECOND // 50).current_imu_ns + delay < sample.stamp_ns:
@@ -829,7 +840,8 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
 
 @pytest.mark.parametrize('seconds', [-100.0, -0.5, 0.5])
 def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
-    jump, at = round(seconds * SECOND), seconds_of(walked.pairs[39].current_imu_ns)
+    jump = round(seconds * SECOND)
+    at = seconds_of(walked.pairs[39].current_imu_ns)
     estimator, first = run(
         walked,
         pairs=walked.pairs[:40],
@@ -867,7 +879,8 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
 @pytest.mark.parametrize('seconds', [-0.115, -0.043, 0.085])
 def test_a_step_of_the_clock_of_the_imu_is_bridged_with_its_doubt(walked, seconds):
     # Pairs are withheld for 0.5 s, until relpose_node has found the step.
-    jump, at = round(seconds * SECOND), 6.02
+    jump = round(seconds * SECOND)
+    at = 6.02
     before, after = (
         [pair for pair in walked.pairs if keeps(pair)]
         for keeps in (
@@ -907,7 +920,8 @@ def test_a_step_of_the_clock_of_the_imu_is_bridged_with_its_doubt(walked, second
 
 
 def test_samples_that_are_late_are_no_clock_that_was_set_back():
-    known, order = ImuSamples(0.05), SampleOrder()
+    known = ImuSamples(0.05)
+    order = SampleOrder()
 
     def at(milliseconds, value=0.0):
         return ImuSample(round(milliseconds * 1e6), (value, 0.0, 1.0), (0.0, value, 9.8))
@@ -1162,7 +1176,9 @@ def test_pairs_without_imu_do_not_accumulate(walked):
 
 
 def test_memory_is_constant_unless_the_path_is_kept(walked):
-    estimator, sizes, begin = OdometryEstimator(PARAMETERS), [], -1.0
+    estimator = OdometryEstimator(PARAMETERS)
+    sizes = []
+    begin = -1.0
     for k in range(0, 60, 20):
         pairs = walked.pairs[k : k + 20]
         end = seconds_of(pairs[-1].current_imu_ns) + 0.1
@@ -1175,7 +1191,8 @@ def test_memory_is_constant_unless_the_path_is_kept(walked):
 
 def objects_behind(root) -> int:
     """Number of objects that an object keeps alive; not those of modules and types."""
-    observed, ahead = {}, [root]
+    observed = {}
+    ahead = [root]
     while ahead:
         one = ahead.pop()
         if id(one) not in observed and not isinstance(one, (type, ModuleType, FunctionType)):
@@ -1185,7 +1202,9 @@ def objects_behind(root) -> int:
 
 
 def test_memory_is_constant_without_pairs():
-    estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
+    estimator = OdometryEstimator(PARAMETERS)
+    rng = np.random.default_rng(0)
+    sizes = []
     for k in range(12_000):  # two minutes
         if k % 4000 == 0:
             sizes.append(len(pickle.dumps(estimator)))
@@ -1250,7 +1269,8 @@ def test_states_are_written_as_they_are(walked, tmp_path):
     follow(estimator, pairs, samples, states.after)
     assert len(states.published) > 50
     assert np.diff([state.imu_ns for state in states.published]).max() < 0.04 * SECOND
-    base, camera = states.published[-1], BASE.camera(states.published[-1])
+    base = states.published[-1]
+    camera = BASE.camera(states.published[-1])
     write_states(tmp_path / 'odometry.csv', [camera])
     header, line = (tmp_path / 'odometry.csv').read_text().splitlines()
     names = header.split(',')
@@ -1281,7 +1301,8 @@ def test_consistency_is_that_of_the_covariances(walked, tracked):
     """Errors of 2 sigma in each axis: 4 per degree of freedom, and 12 is within 99.7 %."""
     _, keyframes = tracked
     origin = keyframes[3]
-    R0, p0 = walked.truth.rotation(origin.imu_ns), walked.truth.position(origin.imu_ns)
+    R0 = walked.truth.rotation(origin.imu_ns)
+    p0 = walked.truth.position(origin.imu_ns)
     turn = exp_so3(np.array([0.0, 0.0, 0.4]))  # the heading of the truth's world is another
     covariance = np.diag(np.square([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
 

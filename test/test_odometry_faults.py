@@ -75,12 +75,17 @@ from rs_relpose_ros.pipeline.pair import PairResult
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
 OWN = '/odometry_node'
-FASTER, IMU_RATE = 2.0, 100.0
+FASTER = 2.0
+IMU_RATE = 100.0
 # Events, in seconds of the walk; those of a gap of the IMU, a clock that is set back and late
 # messages are in test_odometry.
-CAMERA_STOPS, WRONG, RESET, END = (2.6, 5.2), (7.6, 8.2), 10.6, 13.0
+CAMERA_STOPS = (2.6, 5.2)
+WRONG = (7.6, 8.2)
+RESET = 10.6
+END = 13.0
 # Delay of a pair after its image, and of a sample after its time.
-PAIR_DELAY, IMU_DELAY = 0.06, 0.002
+PAIR_DELAY = 0.06
+IMU_DELAY = 0.002
 # Longest start in motion, and the delay of a message, on a busy machine too.
 START = 1.6
 # Where all is good again, by the fault before; up to the next one.
@@ -116,7 +121,8 @@ def pairs_message(pair: PublishedPair, health: Assessment) -> Any:
 def pair_result(pair: PublishedPair, health: Assessment) -> PairResult:
     pose = RelativePose(Status(pair.status))
     if pair.images is not None:
-        zero, eye = np.zeros(3), np.eye(6)
+        zero = np.zeros(3)
+        eye = np.eye(6)
         pose = replace(
             pose,
             R=pair.images.R,
@@ -401,7 +407,8 @@ def test_the_imu_propagates_the_path_while_the_camera_stops(session):
 
 def test_reset_restarts_at_the_origin(session):
     assert session.reset.success
-    first, before = session.published((RESET, END))[0], session.published((RESET - 0.5, RESET))[-1]
+    first = session.published((RESET, END))[0]
+    before = session.published((RESET - 0.5, RESET))[-1]
     assert np.linalg.norm(positions_of([first])) < 2.0 * START
     assert first.pose.covariance[0] < before.pose.covariance[0]
     stamps = [stamp_of(pose) for pose in session.path_after_reset.poses]
@@ -483,9 +490,12 @@ def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float
     (p, R, w), P, nis, path = measured(messages[0]), 1e-2 * np.eye(12), [], []
     for before, message in pairwise(messages):
         dt = (stamp_of(message) - stamp_of(before)) / SECOND
-        F, N, H = np.eye(12), np.zeros((12, 12)), np.eye(12)[used]
+        F = np.eye(12)
+        N = np.zeros((12, 12))
+        H = np.eye(12)[used]
         F[:3, 3:6], F[:3, 6:9], F[3:6, 9:] = -skew(R @ w[:3]) * dt, R * dt, R * dt
-        p, R = p + R @ w[:3] * dt, R @ exp_so3(w[3:] * dt)
+        p = p + R @ w[:3] * dt
+        R = R @ exp_so3(w[3:] * dt)
         # Accelerations of 3 m/s^2 and 3 rad/s^2.
         P = F @ P @ F.T + np.diag([1e-8] * 6 + [9.0 * dt**2] * 6)
         z = measured(message)
@@ -495,8 +505,11 @@ def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float
         )
         S = H @ (P + N) @ H.T
         K = P @ H.T @ np.linalg.inv(S)
-        x, P = K @ e, P - K @ S @ K.T
-        p, R, w = p + x[:3], exp_so3(x[3:6]) @ R, w + x[6:]
+        x = K @ e
+        P = P - K @ S @ K.T
+        p = p + x[:3]
+        R = exp_so3(x[3:6]) @ R
+        w = w + x[6:]
         nis.append(e @ np.linalg.solve(S, e) / len(e))
         path.append(p)
     return np.array(path), float(np.mean(nis))
@@ -585,7 +598,8 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
     ]
     assert len(of_keyframes) >= 10
     for message, place in zip(of_keyframes, positions_of(of_keyframes), strict=True):
-        keyframe, q = keyframes[nearest(message)], message.pose.pose.orientation
+        keyframe = keyframes[nearest(message)]
+        q = message.pose.pose.orientation
         # Half a millisecond apart at 1.2 m/s and 60 deg/s.
         np.testing.assert_allclose(place, keyframe.position, atol=2e-3)
         turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv() * Rotation.from_matrix(keyframe.R)

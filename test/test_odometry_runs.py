@@ -55,7 +55,8 @@ def end_error(path, truth):
 
 
 def test_loops_that_agree_with_the_path_correct_it():
-    given, rng = walk('walk:12', 12.0, imu_rate=100.0), np.random.default_rng(3)
+    given = walk('walk:12', 12.0, imu_rate=100.0)
+    rng = np.random.default_rng(3)
     estimator, _ = run(given)
     before = estimator.smoothed()
     ends = list(zip(before[:24:3], before[:-25:-3], strict=True))
@@ -271,7 +272,8 @@ def test_a_recording_in_parts(monkeypatch, tmp_path):
     )
 
     def feed_of(part):
-        first, last = part.arrivals[0].stamp_ns, part.arrivals[-1].stamp_ns
+        first = part.arrivals[0].stamp_ns
+        last = part.arrivals[-1].stamp_ns
         is_first = last < START_NS + 6e9
         return disturbances.Feed(
             PARAMETERS.to_mapping(),

@@ -94,7 +94,8 @@ def test_a_drift_is_named_and_its_sigma_holds_all_over_the_recording():
 
 
 def test_recordings_whose_clocks_change_are_not_joined():
-    one, other = recorded(32, frames=300), recorded(32, frames=300)
+    one = recorded(32, frames=300)
+    other = recorded(32, frames=300)
     stepped = shifted(other, 0.06 * (times_of(other) >= 4.0))
     inputs = [CalibrationInput(r.tracks, r.gyro, camera_of(r), True, {}) for r in (one, stepped)]
     with pytest.raises(InputError, match='within recording 2'):

@@ -72,7 +72,8 @@ def test_late_messages_and_wrong_stamps_are_no_clock_that_was_set_back(change):
 # Set back by less than the recording lasts, and by the range of a counter of 32 bits.
 @pytest.mark.parametrize('jump', [120 * MS, 500 * MS, 4_294_967_296_000])
 def test_after_a_clock_was_set_back_the_order_of_the_file_counts(jump):
-    imu, images = IMU_STAMPS.copy(), IMAGE_STAMPS.copy()
+    imu = IMU_STAMPS.copy()
+    images = IMAGE_STAMPS.copy()
     imu[200:] -= jump
     images[31:] -= jump
     assert list(np.unique(clock_runs(imu), return_counts=True)[1]) == [200, 200]

@@ -72,7 +72,8 @@ def loaded_by(*prefixes: str) -> set[str]:
 @functools.cache
 def imports(path: Path) -> list[str]:
     """Return absolute names of what a module imports, wherever in it, except for types only."""
-    found, todo = [], [ast.parse(path.read_text())]
+    found = []
+    todo = [ast.parse(path.read_text())]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):

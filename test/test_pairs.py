@@ -164,7 +164,8 @@ def test_results_replace_those_of_an_earlier_run_but_not_the_list(
     def refuse(_: object, role: Role, message: object) -> InputError | None:
         return InputError('not calibrated') if role is Role.CAMERA_INFO else None
 
-    listed, out = tmp_path / 'relative_poses.csv', tmp_path / 'out'
+    listed = tmp_path / 'relative_poses.csv'
+    out = tmp_path / 'out'
     listed.write_text(f'{HEAD}1,2\n')
     refused('would replace the list', *pairs_command(bundled_bag, listed, tmp_path))
     assert listed.read_text() == f'{HEAD}1,2\n'
@@ -176,7 +177,8 @@ def test_results_replace_those_of_an_earlier_run_but_not_the_list(
     assert not list(out.iterdir())
 
 
-FPS, SECONDS = 5.0, 6.0
+FPS = 5.0
+SECONDS = 6.0
 LAST = round(FPS * SECONDS) - 1
 CLOSE = 4  # frames from the first one, 0.8 s
 
@@ -233,7 +235,8 @@ def test_loop_is_closed(returned, tmp_path):
 def library(returned):
     """Parameters, a buffer of the whole walk, and its first and last frame."""
     _, parameter_file, simulation = returned
-    camera, series = simulation.camera, simulation.imu
+    camera = simulation.camera
+    series = simulation.imu
     parameters = read_parameters(parameter_file, ['imu_buffer_seconds=60'])
     imu = ImuBuffer(parameters.imu)
     for stamp, rate, force in zip(
@@ -266,7 +269,9 @@ def test_frames_and_an_imu_buffer(library, returned):
 def test_frames_between_close_ones_are_used(library, returned):
     parameters, imu, _ = library
     parameters = parameters.updated({'max_keyframe_interval': 1.0})
-    simulation, views, done = returned[2], [], {}
+    simulation = returned[2]
+    views = []
+    done = {}
     frames = [
         Frame(
             simulation.stamp_ns(k), simulation.image(k), 'camera', intrinsics_of(simulation.camera)
@@ -301,7 +306,9 @@ def test_images_are_kept_until_the_last_of_their_pairs(library):
     """Four frames in a row: the first waits for the last, the second only for the third."""
     parameters, imu, (frame, _) = library
     stamps = [START_NS + k * 10**9 for k in range(4)]
-    pairs, images, done = ChosenPairs([(stamps[0], stamps[3]), (stamps[1], stamps[2])]), [], {}
+    pairs = ChosenPairs([(stamps[0], stamps[3]), (stamps[1], stamps[2])])
+    images = []
+    done = {}
     since = None
     for stamp in stamps:
         image = np.zeros_like(frame.image)

@@ -86,7 +86,8 @@ def test_directions(direction, turns):
 
 def test_rotating_camera_shows_the_turned_pixel(turns):
     camera = CAMERA
-    turned, R = turned_camera(camera, turns), turned_axes(turns)
+    turned = turned_camera(camera, turns)
+    R = turned_axes(turns)
     rotations = Rotation.from_rotvec(
         np.linspace(-1.0, 1.0, 9)[:, None] * np.array([0.02, -0.03, 0.05])
     ).as_matrix()
@@ -281,7 +282,8 @@ def test_calibration_finds_columns(turns, direction, tmp_path):
 def compared(true, monkeypatch, deviation=None):
     """Findings on pairs that `true` exposed, with the configuration of the monitor's tests."""
     monkeypatch.setattr(test_monitor, 'deviating', lambda camera, c: true)
-    rng, directions = np.random.default_rng(4), ReadoutDirections()
+    rng = np.random.default_rng(4)
+    directions = ReadoutDirections()
     for k in range(9):
         pair = test_monitor.pair_data(0.4 * k, 0.4 * k + 0.3, NONE)
         noise = rng.normal(0.0, 0.2, (2, *pair.points1.shape))

@@ -81,7 +81,8 @@ def test_the_table_of_a_live_run_is_that_of_the_replay(results, tmp_path):
 
 
 def with_images(result: PairResult) -> PairResult:
-    rng, pose = np.random.default_rng(0), result.pose
+    rng = np.random.default_rng(0)
+    pose = result.pose
     root = rng.normal(size=(11, 11))
     return replace(
         result,
@@ -114,7 +115,8 @@ def test_what_was_published_is_read_back(results, types, kind):
             pose=replace(results[0].pose, baseline=0.25, baseline_log_sigma=0.1),
         )
     )
-    pair, pose = published_pair(build.pair_messages(result, types)), result.pose
+    pair = published_pair(build.pair_messages(result, types))
+    pose = result.pose
     assert (bool(pair), pair.rotation_known) == (bool(pose), pose.rotation_known)
     assert (pair.status, pair.reason, pair.frame_id) == (pose.status.value, pose.reason, 'camera')
     assert (
@@ -177,7 +179,8 @@ def test_a_topic_may_run_ahead(pairs, results):
 
 def test_incomplete_pairs_do_not_accumulate(pairs):
     synchronizer = PairSynchronizer(capacity=3)
-    lost, whole = pairs[0]['velocity'], pairs[1]
+    lost = pairs[0]['velocity']
+    whole = pairs[1]
     for number in range(100):
         lost = copy.deepcopy(lost)
         lost.header.stamp.sec += 1
@@ -471,9 +474,11 @@ def test_wrong_tracks_do_not_move_the_scale_much():
 @pytest.mark.parametrize('noise', [1e-4, 3e-4])  # rad
 def test_sigma_of_the_scale(noise):
     """Of 200 draws of the rays' noise, against their scatter."""
-    flight, rng = simulated_flight(3), np.random.default_rng(5)
+    flight = simulated_flight(3)
+    rng = np.random.default_rng(5)
     true = flight.baselines[1] / flight.baselines[0]
-    errors, sigmas = [], []
+    errors = []
+    sigmas = []
     for _ in range(200):
         chain = PoseChain()
         for pair in published(flight.pairs)[:2]:

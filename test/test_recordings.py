@@ -102,7 +102,8 @@ def corners(recordings):
 
 def solved(frames, intrinsics, distortion):
     """``X_cam = R X_target + t`` of each image, by OpenCV's PnP of its corners."""
-    K, d = camera_of(intrinsics, distortion).camera_matrix, np.array(distortion)
+    K = camera_of(intrinsics, distortion).camera_matrix
+    d = np.array(distortion)
     poses = []
     for frame in frames:
         _, r, t = cv2.solvePnP(frame.target, frame.pixels, K, d, flags=cv2.SOLVEPNP_ITERATIVE)
@@ -182,7 +183,8 @@ def test_gravity_of_a_hand_held_camera(corners, given, recordings, R_cam_imu):
         if imu.gyro.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE
     }
     up = np.mean([imu.force.between(at, at)[1][0] @ R for at, R in R_imu_target.items()], axis=0)
-    errors, sigmas = [], []
+    errors = []
+    sigmas = []
     for at, R in R_imu_target.items():
         if at > corners[0].stamp_ns + 10_000_000_000:
             estimate = imu.gravity(at)
@@ -232,7 +234,8 @@ def far_pairs(corners, truth, imu, every):
 
 def test_two_views_of_the_target(corners, given, imu, R_cam_imu):
     """The requirement: rotation 0.45 deg and translation 3 deg in the median."""
-    camera, pairs = camera_of(*CALIBRATED), far_pairs(corners, given, imu, 6)
+    camera = camera_of(*CALIBRATED)
+    pairs = far_pairs(corners, given, imu, 6)
     assert len(pairs) > 100
     errors = []
     for i, j in pairs:
@@ -288,7 +291,8 @@ def test_ten_frames_in_flight(flight, recordings, R_cam_imu, step, config):
     tracker.start(first)
     for _, image, *_ in frames:
         tracker.track(image, None)
-    matches, (end, _, R2, p2) = tracker.refined_matches(), frames[-1]
+    matches = tracker.refined_matches()
+    (end, _, R2, p2) = frames[-1]
     rotation, covariance = (
         R_cam_imu @ found @ R_cam_imu.T for found in imu.rotation(min(start, end), max(start, end))
     )
@@ -346,7 +350,8 @@ def poses_to_start_from(rays, focal_length):
     """
     starts = []
     for rays1, rays2 in rays:
-        x1, x2 = rays1 / rays1[:, 2:], rays2 / rays2[:, 2:]
+        x1 = rays1 / rays1[:, 2:]
+        x2 = rays2 / rays2[:, 2:]
         for seed in (0, 1):
             cv2.setRNGSeed(seed)
             essential, _ = cv2.findEssentialMat(
@@ -372,7 +377,8 @@ def robust_cost(rays1, rays2, focal_length, starts, row_times=None):
     With the row times (N,) of both frames [s] six more are free, the two linear velocities
     (10 baselines per second, 1 sigma).
     """
-    x1, x2 = rays1 / rays1[:, 2:], rays2 / rays2[:, 2:]
+    x1 = rays1 / rays1[:, 2:]
+    x2 = rays2 / rays2[:, 2:]
     best = np.inf
     for R, t in starts:
         B = np.linalg.svd(t[None])[2][1:].T

@@ -64,7 +64,8 @@ def true_motion(bundled_bag: Path) -> Callable[[dict[str, str]], tuple[Rotation,
         connections = [c for c in reader.connections if c.topic == '/ground_truth/pose']
         for connection, _, data in reader.messages(connections):
             msg = reader.deserialize(data, connection.msgtype)
-            p, q = msg.pose.position, msg.pose.orientation
+            p = msg.pose.position
+            q = msg.pose.orientation
             seconds = (stamp_ns(msg.header) - START_NS) / 1e9
             poses.append((seconds, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     times, *positions = np.array(poses).T[:4]
@@ -106,7 +107,8 @@ def test_table_has_the_header_and_whole_rows(replayed):
 
 def test_errors_agree_with_an_independent_calculation(replayed, true_motion):
     errors = {row['stamp_ns']: row for row in rows_of(replayed / 'errors.csv')}
-    rotation_errors, translation_errors = [], []
+    rotation_errors = []
+    translation_errors = []
     for row in rows_of(replayed / 'relative_poses.csv'):
         R_true, t_true = true_motion(row)  # time_offset of this bag is 0
         written = errors[row['stamp_ns']]
@@ -173,7 +175,8 @@ def test_poses_between_the_middle_rows(replayed, bundled_bag, true_motion, tmp_p
 
 
 def test_summary_agrees_with_the_table(replayed, bundled_bag):
-    summary, rows = summary_of(replayed), rows_of(replayed / 'relative_poses.csv')
+    summary = summary_of(replayed)
+    rows = rows_of(replayed / 'relative_poses.csv')
     assert summary['pairs']['total'] == len(rows)
     for status, count in summary['pairs']['by_status'].items():
         assert count == sum(row['status'] == status for row in rows)
@@ -263,7 +266,9 @@ def image_stamps(bag: Path) -> list[int]:
 
 
 def test_two_runs_are_equal_and_stamps_restrict(replayed, bundled_bag, tmp_path, capsys):
-    stamps, file, out = image_stamps(bundled_bag), tmp_path / 'stamps.txt', tmp_path / 'out'
+    stamps = image_stamps(bundled_bag)
+    file = tmp_path / 'stamps.txt'
+    out = tmp_path / 'out'
 
     def table(chosen: list[int]) -> Path:
         file.write_text('\n'.join(map(str, chosen)))
@@ -290,7 +295,8 @@ def test_two_runs_are_equal_and_stamps_restrict(replayed, bundled_bag, tmp_path,
 
 def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path, capsys):
     """The first 1.2 s with a time offset that is 15 ms off, to earlier rows: no row's."""
-    stamps, out = tmp_path / 'stamps.txt', tmp_path / 'out'
+    stamps = tmp_path / 'stamps.txt'
+    out = tmp_path / 'out'
     stamps.write_text('\n'.join(map(str, image_stamps(bundled_bag)[:37])))
     code, shown, _ = replay(
         capsys,
@@ -331,7 +337,8 @@ def test_recordings(converted, tmp_path, name):
     exposure of the RealSense's file, with which the monitor reports a wrong gyro bias in this
     mode: a false alarm (docs/lab/benchmarks.md).
     """
-    bag, out = converted(name), tmp_path / 'out'
+    bag = converted(name)
+    out = tmp_path / 'out'
     assert (
         main(
             [
@@ -579,7 +586,8 @@ def test_output_that_is_a_file_is_refused_before_any_work(
     monkeypatch.setattr('rs_relpose_ros.bags.reader.Bag.messages', work)
     monkeypatch.setattr('rs_relpose_ros.bags.reader.Bag.raw_messages', work)
     monkeypatch.setattr('rs_relpose_ros.cli.batch.open_cluster', work)
-    file, listed = tmp_path / 'out', tmp_path / 'list.csv'
+    file = tmp_path / 'out'
+    listed = tmp_path / 'list.csv'
     file.write_text('precious')
     listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
     meant = {

@@ -180,7 +180,8 @@ def test_a_damaged_bag_has_a_page_that_says_so(damaged, tmp_path, capsys):
 
 @pytest.mark.parametrize('content', [b'\x89MCAP0\r\n', b'SQLite format 3\x00' + b'x' * 100])
 def test_a_bag_without_anything_that_can_be_read(content, tmp_path):
-    bag, out = tmp_path / 'empty.mcap', tmp_path / 'page.html'
+    bag = tmp_path / 'empty.mcap'
+    out = tmp_path / 'page.html'
     bag.write_bytes(content)
     words = ['report', str(bag), '--out', str(out), '--no-images']
     assert command_line.main(words) == command_line.FAILED

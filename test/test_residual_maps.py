@@ -47,7 +47,8 @@ def walk(seconds=20.0, seed=0, matches=120):
     rng = np.random.default_rng(seed)
     found = []
     for k in range(round(7.0 * seconds)):
-        cell, band = rng.integers(0, 24, matches), rng.integers(0, 6, matches)
+        cell = rng.integers(0, 24, matches)
+        band = rng.integers(0, 6, matches)
         noise = rng.normal(size=(3, matches))
         found.append(
             PairSums(
@@ -103,7 +104,8 @@ def test_a_biased_cell_is_found(cell):
     assert found['cells'].worst == 24 + cell
     assert found['cells'].mean == pytest.approx(0.5, abs=0.15)
     assert found['cells'].expectation[24 + cell] == 0.0
-    column, row = cell % 6 + 1, cell // 6 + 1
+    column = cell % 6 + 1
+    row = cell // 6 + 1
     health = with_maps(CONSISTENT, maps_of(moved))
     (fault,) = health.faults
     assert (fault.code, fault.state) == (Code.UNKNOWN_CAUSE, FindingState.SUSPECT)
@@ -234,7 +236,8 @@ def counted(function, calls):
 
 
 def test_live_and_offline_have_the_same_maps():
-    live, offline = ResidualMaps.of_last_seconds(), ResidualMaps()
+    live = ResidualMaps.of_last_seconds()
+    offline = ResidualMaps()
     for one in walk(12.0):
         live.add(one)
         offline.add(one)
@@ -300,7 +303,8 @@ def test_in_a_run_a_pattern_does_not_stand_beside_what_is_found_later():
 def rendered(shift):
     """A pair of global-shutter images whose points in a part are moved by `shift` (2,) [px]."""
     rng = np.random.default_rng(8)
-    R, t = exp_so3(np.array([0.02, -0.05, 0.03])), np.array([0.8, 0.0, 0.6])
+    R = exp_so3(np.array([0.02, -0.05, 0.03]))
+    t = np.array([0.8, 0.0, 0.6])
     pixels = rng.uniform((0, 0), (VIEW.width, VIEW.height), (300, 2))
     rays = np.concatenate([(pixels - (280.0, 210.0)) / FOCAL, np.ones((300, 1))], axis=1)
     points = rays * rng.uniform(8.0, 30.0, (300, 1))

@@ -55,7 +55,8 @@ def knots(path, times, *, bias_error=0.0, noise=0.0):
     states = path.states(times)
     found = []
     for k, seconds in enumerate(times):
-        R_cam, w = states.R_world_cam[k], states.angular_velocity[k]
+        R_cam = states.R_world_cam[k]
+        w = states.angular_velocity[k]
         ns = START_NS + round(seconds * 1e9)
         found.append(
             Knot(
@@ -138,7 +139,8 @@ def test_errors_of_keyframes_and_biases_are_spread(path):
 
 
 def test_velocity_is_the_derivative_of_the_pose(rows):
-    at, step = TIMES[50:150], 100_000
+    at = TIMES[50:150]
+    step = 100_000
     for frame in ('camera', 'imu', 'base'):
         v, w = rows.velocity(at, frame)
         (R1, p1), (R, _), (R2, p2) = (rows.pose(at + k * step, frame) for k in (-1, 0, 1))
@@ -260,7 +262,9 @@ def test_without_two_keyframes_there_is_no_trajectory(path):
 
 # -- Files of reconstruction tools -----------------------------------------------------------
 
-READOUT, W, H = 0.025, 640, 480
+READOUT = 0.025
+W = 640
+H = 480
 LENSES = {
     'pinhole': ('plumb_bob', ()),
     'brown': ('plumb_bob', (-0.12, 0.05, 0.0008, -0.0005)),
@@ -403,7 +407,8 @@ def read_nerfstudio(folder, model, lens):
         value.get(name, 0.0)
         for name in (('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3'))
     ]
-    fx, fy = K[0, 0], K[1, 1]
+    fx = K[0, 0]
+    fy = K[1, 1]
     out = []
     for f, point in model.observed:
         frame = value['frames'][f]
@@ -413,7 +418,8 @@ def read_nerfstudio(folder, model, lens):
         v, w = (flip * frame[f'camera_{kind}_velocity'] for kind in ('linear', 'angular'))
         total = v + np.cross(w, (x, y, z))
         J = np.array([[fx / z, 0.0, -fx * x / z**2], [0.0, fy / z, -fy * y / z**2]])
-        start, speed = np.array([fx * x / z, fy * y / z]) + K[:2, 2], -J @ total
+        start = np.array([fx * x / z, fy * y / z]) + K[:2, 2]
+        speed = -J @ total
         moved = iterated(
             lambda row, start=start, speed=speed: (
                 start + speed * value['rolling_shutter_time'] * (row / value['h'] - 0.5)
@@ -475,7 +481,8 @@ def read_gsplat(folder, model, lens):
     """Cameras.cuh: world to camera, t = floor(y) / (H - 1), or (H - ceil(y)) / (H - 1)."""
     value = np.load(folder / 'cameras.npz')
     assert str(value['camera_model']) == ('fisheye' if lens == 'fisheye' else 'pinhole')
-    k, p = value['radial_coeffs'], value['tangential_coeffs']
+    k = value['radial_coeffs']
+    p = value['tangential_coeffs']
     coefficients = k if lens == 'fisheye' else [*k[:2], *p, *k[2:], *value['thin_prism_coeffs']]
     shutter = {0: 'down', 2: 'up', 4: 'global'}[int(value['rolling_shutter'])]
     return np.array(
@@ -551,7 +558,8 @@ CASES = [
 def test_a_reader_of_the_format_gets_the_same_pixels(
     name, lens, direction, rolls, trajectory, tmp_path
 ):
-    chosen, model = FORMATS[name], made(trajectory, lens, direction, rolls)
+    chosen = FORMATS[name]
+    model = made(trajectory, lens, direction, rolls)
     model = formats.replace(model, camera=formats.fitted(model.camera, chosen.radial))
     if name == 'ncore':  # its files contain the images
         (tmp_path / 'images').mkdir()
@@ -571,7 +579,8 @@ def test_a_reader_of_the_format_gets_the_same_pixels(
 def test_the_formula_of_a_rolling_shutter_is_near_the_trajectory(name, direction, trajectory):
     """0.7 rad/s, 3 to 6 rad/s^2 and 1.6 m/s, 3 m in front."""
     model = made(trajectory, 'pinhole', direction)
-    k, guess = model.observed[:, 0], np.full(10, 240.0)
+    k = model.observed[:, 0]
+    guess = np.full(10, 240.0)
     true, linear, single = (
         formats.projected(place, model, k, model.points, guess)
         for place in (formats.path(trajectory), FORMATS[name].place, formats.middle)

@@ -170,7 +170,9 @@ def test_the_queue_is_bounded_and_the_oldest_are_counted(
 
 
 def test_offline_drops_nothing_and_needs_no_clock():
-    offline, items, times_ms = replaying(), [], [33 * k for k in range(100)]
+    offline = replaying()
+    items = []
+    times_ms = [33 * k for k in range(100)]
     add_frames(offline, *times_ms)
     for ms in range(0, 33 * 99 + 10, 10):
         offline.add_imu(sample(ms))
@@ -359,7 +361,9 @@ def test_interleaving_does_not_change_the_result(early, takes):
         for k in range(200)
     ]
     times_ms = list(range(33, 957, 66))
-    patient, eager, items = replaying(), replaying(), []
+    patient = replaying()
+    eager = replaying()
+    items = []
     for one in samples:
         patient.add_imu(one)
     add_frames(patient, *times_ms)
@@ -406,7 +410,8 @@ def test_the_offset_follows_the_interval_to_the_frame_before():
 
 def test_the_offset_by_interval_is_that_of_the_live_node_if_frames_are_dropped(clock):
     times_ms = [50, 90, 130, 170, 220, 270, 320, 370, 430, 490]
-    live, replay = Sequencer(parameters(**BY_INTERVAL), clock=clock), replaying(**BY_INTERVAL)
+    live = Sequencer(parameters(**BY_INTERVAL), clock=clock)
+    replay = replaying(**BY_INTERVAL)
     for sequencer in (live, replay):
         add_imu(sequencer, 0, 600)
     add_frames(live, *times_ms)
@@ -484,7 +489,8 @@ def test_an_exposure_longer_than_the_interval_is_refused():
 
 @pytest.mark.parametrize(('frames', 'lost'), [(5, 0), (32, 0), (60, 12)])
 def test_the_scatter_is_that_of_the_stamps_whether_or_not_frames_are_lost(frames, lost):
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    found = []
     for _ in range(300):
         kept = np.delete(jittering(rng, frames), rng.choice(frames, lost, replace=False))
         found.append(module.stamp_scatter(kept[-module.SCATTER_FRAMES :]).sigma)
@@ -531,7 +537,8 @@ def delays(kind, mean, rng, count=32):
 )
 def test_one_sided_delays_are_jitter_of_their_size(kind, mean, least):
     rng = np.random.default_rng(round(1e6 * mean))
-    sigmas, found = [], []
+    sigmas = []
+    found = []
     for _ in range(200):
         late = delays(kind, mean, rng)
         stamps_ns = np.sort(EVEN[:32] + np.round(1e9 * late).astype(np.int64))

@@ -42,7 +42,9 @@ def on_wall(**changes):
 @functools.cache
 def blob_wall():
     """A wall 7 m ahead with a grid of blobs, and the blobs' centres in the world."""
-    texel, spacing, sigma = 0.02, 0.8, 0.055
+    texel = 0.02
+    spacing = 0.8
+    sigma = 0.055
     x, y = np.meshgrid((np.arange(1000) + 0.5) * texel, (np.arange(600) + 0.5) * texel)
     away = [(c + spacing / 2) % spacing - spacing / 2 for c in (x, y)]
     gray = 40.0 + 190.0 * np.exp(-(away[0] ** 2 + away[1] ** 2) / (2 * sigma**2))
@@ -131,7 +133,8 @@ def test_rendered_rows_are_those_of_their_times(direction, stamp_row):
         **NOISE_FREE,
     )
     simulation = simulate(config, scene=scene)
-    errors, wrong_sign = [], []
+    errors = []
+    wrong_sign = []
     for index in (3, 17):
         image = simulation.image(index)
         time = (simulation.reference_ns(index) - config.start_ns) * 1e-9
@@ -197,7 +200,8 @@ def walk(seed, seconds, rotation_rate):
 
 def test_trajectory_derivatives_are_exact():
     trajectory = walk(3, 6.0, rotation_rate=0.6)
-    times, h = np.linspace(0.0, 6.0, 300), 1e-4
+    times = np.linspace(0.0, 6.0, 300)
+    h = 1e-4
     here, before, after = (trajectory.states(times + d) for d in (0.0, -h, h))
     for name, of, tolerance in (
         ('velocity', 'position', 2e-6),

@@ -113,7 +113,8 @@ def residual(solution, f1, f2, tau1, tau2):
 @each_exact_case
 def test_solutions_of_exact_matches(solver, motion):
     """The truth is among them; all are distinct, satisfy the constraint and know gravity."""
-    P, residuals = problems(solver, 1, 100, **motion), []
+    P = problems(solver, 1, 100, **motion)
+    residuals = []
     f1, f2 = rays(solver, P)
     for k in range(100):
         solutions = solve(solver, P, k)
@@ -159,7 +160,8 @@ def test_closed_forms_find_the_truth(solver, motion, count):
 )
 def test_the_number_of_solutions_is_that_of_an_eigenvalue_problem(solver, motion):
     """``A(psi)`` is quadratic in tan(psi / 2): its real eigenvalues (LAPACK) are all solutions."""
-    P, total = problems(solver, 6, 300, **motion), 0
+    P = problems(solver, 6, 300, **motion)
+    total = 0
     f1, f2 = rays(solver, P)
     for k in range(300):
         yaws = real_yaws(f1[k], f2[k], P.tau1[k], P.tau2[k], P.gravity1[k], P.gravity2[k])
@@ -180,7 +182,8 @@ def yaw_of(R, gravity1, gravity2):
 
 
 def real_yaws(f1, f2, tau1, tau2, gravity1, gravity2):
-    a, b = f1 @ upright(gravity1).T, f2 @ upright(gravity2).T
+    a = f1 @ upright(gravity1).T
+    b = f2 @ upright(gravity2).T
 
     def matrix(rotation):
         n = np.cross(a, b @ np.asarray(rotation, dtype=float).T)
@@ -193,7 +196,8 @@ def real_yaws(f1, f2, tau1, tau2, gravity1, gravity2):
     sine = matrix([[0, -1, 0], [1, 0, 0], [0, 0, 0]])
     # (1 + x^2) fixed + (1 - x^2) cosine + 2 x sine, with x = tan(yaw / 2)
     size = len(f1)
-    eye, zero = np.eye(size), np.zeros((size, size))
+    eye = np.eye(size)
+    zero = np.zeros((size, size))
     values = scipy.linalg.eigvals(
         np.block([[zero, eye], [-fixed - cosine, -2.0 * sine]]),
         np.block([[eye, zero], [zero, fixed - cosine]]),
@@ -263,7 +267,8 @@ def test_9_points_find_the_rotation_if_the_velocities_are_not_observable(solver,
 @pytest.mark.parametrize(('tau1', 'tau2'), [(0.0, 0.0), (0.02, 0.02), (-0.01, 0.03)])
 def test_a_global_shutter_has_no_velocities(solver, tau1, tau2):
     """Velocities are not observable from equal row times: no solution with 9 and 11 points."""
-    P, n = problems(solver, 12, 5, speed=(0, 0), rate=(0, 0)), POINTS[solver]
+    P = problems(solver, 12, 5, speed=(0, 0), rate=(0, 0))
+    n = POINTS[solver]
     for k in range(5):
         found = solver(
             P.rays1[k],
@@ -359,7 +364,8 @@ def test_5_points_against_opencv():
 
 @each_solver
 def test_table_functions_and_modes_of_the_estimator_agree(solver):
-    row, mode = SOLVERS[solver.__name__], MODES[solver.__name__]
+    row = SOLVERS[solver.__name__]
+    mode = MODES[solver.__name__]
     assert (
         set(solvers.__all__)
         == {'MinimalSolution', *SOLVERS}

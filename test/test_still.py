@@ -28,7 +28,8 @@ from rs_relpose_ros.tracking import still
 from rs_relpose_ros.tracking.features import find_corners, make_tracker, within
 from rs_relpose_ros.tracking.still import COLUMNS, ROWS, StillParts
 
-WIDTH, HEIGHT = 320, 240
+WIDTH = 320
+HEIGHT = 240
 INTERVAL_NS = 33_000_000
 
 
@@ -59,7 +60,8 @@ def added(parts, number, image, motion):
 
 
 def test_images_of_a_moving_camera_are_new():
-    parts, before = StillParts(), None
+    parts = StillParts()
+    before = None
     for number, (place, image) in enumerate(walk(120)):
         repeated = added(parts, number, image, np.zeros(2) if before is None else before - place)
         assert not repeated
@@ -68,7 +70,9 @@ def test_images_of_a_moving_camera_are_new():
 
 
 def test_repeated_images_are_found_whatever_their_bytes():
-    parts, before, rng = StillParts(), None, np.random.default_rng(5)
+    parts = StillParts()
+    before = None
+    rng = np.random.default_rng(5)
     found = []
     for number, (place, image) in enumerate(walk(60, step=(9.0, 9.0))):
         motion = np.zeros(2) if before is None else before - place
@@ -90,7 +94,9 @@ def test_a_camera_at_rest_repeats_nothing():
 
 def test_repeated_images_are_found_where_the_camera_does_not_turn():
     """What repetitions look like is known from the seconds in which the camera turned."""
-    parts, before, rng = StillParts(), None, np.random.default_rng(5)
+    parts = StillParts()
+    before = None
+    rng = np.random.default_rng(5)
     verdicts = []
     for number, (place, image) in enumerate(walk(60)):
         motion = np.zeros(2) if before is None else place - before
@@ -106,7 +112,8 @@ def test_repeated_images_are_found_where_the_camera_does_not_turn():
 
 
 def test_a_camera_at_rest_after_repetitions_is_not_silent():
-    parts, rng = StillParts(), np.random.default_rng(6)
+    parts = StillParts()
+    rng = np.random.default_rng(6)
     images = list(walk(21))
     for number, (_, image) in enumerate(images):
         added(parts, 2 * number, image, (9.0, 4.0))
@@ -139,7 +146,8 @@ def test_an_object_that_moves_slowly_is_no_static_part():
     part = np.zeros((HEIGHT, WIDTH), dtype=bool)
     part[:, WIDTH // 3 :] = True
     for speed in (0.0, 1.0):
-        parts, before = StillParts(), None
+        parts = StillParts()
+        before = None
         steps = walk(150, part, step=(14.0, 9.0), speed=speed)
         for number, (place, image) in enumerate(steps):
             motion = np.zeros(2) if before is None else before - place
@@ -155,7 +163,8 @@ def test_static_parts_are_found_and_masked(side):
         static[:, : WIDTH // 4] = True
     else:
         static[-HEIGHT // 4 :] = True
-    parts, before = StillParts(), None
+    parts = StillParts()
+    before = None
     for number, (place, image) in enumerate(walk(150, static)):
         repeated = added(parts, number, image, np.zeros(2) if before is None else before - place)
         assert not repeated
@@ -179,7 +188,8 @@ def test_static_parts_are_found_and_masked(side):
 def test_static_parts_are_forgotten_when_they_move_again():
     static = np.zeros((HEIGHT, WIDTH), dtype=bool)
     static[:, :80] = True
-    parts, before = StillParts(), None
+    parts = StillParts()
+    before = None
     for number, (place, image) in enumerate([*walk(150, static), *walk(160, seed=4)]):
         motion = np.zeros(2) if before is None or number == 150 else before - place
         added(parts, number, image, motion)

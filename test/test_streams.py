@@ -20,7 +20,8 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.burst_times import find_bursts, SampleTimes
 from rs_relpose_ros.messages.streams import counter_unit, find_multiplied, SensorRate
 
-IMU, IMAGES = '/imu/data_raw', '/camera/image_raw/compressed'
+IMU = '/imu/data_raw'
+IMAGES = '/camera/image_raw/compressed'
 SECOND = 10**9
 # A message with the topic and the time [ns] of its reception.
 Entry = tuple[str, str, Any, int]
@@ -42,7 +43,9 @@ def changed(bag: Path, out: Path, change: Callable[[int, Entry], Iterator[Entry]
         types = {topic.name: topic.msgtype for topic in opened.topics}
         entries = []
         for entry in opened.messages(opened.topics):
-            topic, received, message = entry.topic, entry.bag_time_ns, entry.message
+            topic = entry.topic
+            received = entry.bag_time_ns
+            message = entry.message
             number = counts[topic] = counts.get(topic, -1) + 1
             entries += list(change(number, (topic, types[topic], message, received)))
         for topic, msgtype, message, received in sorted(entries, key=lambda entry: entry[3]):
@@ -385,7 +388,8 @@ def test_multiplied_values_have_their_factor():
     lines = np.stack([np.interp(at, np.arange(500), column) for column in turning.T], axis=1)
     factor, how = find_multiplied(lines.astype(np.float32))
     assert how == 'interpolated' and factor == pytest.approx(4.0, rel=0.02)
-    rate, changes = SensorRate(), 0
+    rate = SensorRate()
+    changes = 0
     for number, one in enumerate((*turning[:200].tolist(), *held[:800].tolist())):
         changes += rate.add(number * 5_000_000, tuple(one))
     assert rate.factor == 4.0 and changes == 1

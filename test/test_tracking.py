@@ -145,7 +145,8 @@ def test_what_lies_beyond_a_patch_or_the_image_is_lost(images, points):
 
 def test_warped_patches_are_those_of_the_warped_image(images, points):
     H = np.array([[1.02, 0.05, -3.0], [-0.04, 0.98, 6.0], [2e-5, -1e-5, 1.0]])
-    image, radius = images[0], 11
+    image = images[0]
+    radius = 11
     height, width = image.shape
     warped = cv2.warpPerspective(
         image,
@@ -237,7 +238,8 @@ def test_the_reference_corrects_the_drift(scene):
     tracker.track(images[7])
     # Matches given out do not change later.
     np.testing.assert_array_equal(followed.points2, before)
-    H1, H2 = hand_held(scene, 0), hand_held(scene, 8)
+    H1 = hand_held(scene, 0)
+    H2 = hand_held(scene, 8)
     assert len(refined) > 0.85 * 300
     assert np.median(errors(refined, H1, H2)) < 0.1
     assert np.median(errors(refined, H1, H2)) < 0.5 * np.median(errors(followed, H1, H2))
@@ -370,7 +372,8 @@ def test_images_that_share_nothing_have_few_matches(scene, detector, most):
     ('detector', 'value'), [('klt', 0), ('klt', 255), ('sift', 0), ('orb', 0)]
 )
 def test_blank_frames_lose_all_tracks_and_good_ones_bring_new(scene, detector, value):
-    good, blank = scene.view(), np.full((480, 640), value, dtype=np.uint8)
+    good = scene.view()
+    blank = np.full((480, 640), value, dtype=np.uint8)
     tracker = started(good, detector=detector)
     assert len(tracker.track(blank)) == 0
     assert tracker.tracked_fraction == 0.0
@@ -395,7 +398,8 @@ def test_tiny_images_do_no_harm(detector, shape):
 
 @pytest.mark.parametrize('detector', ['klt', 'orb'])
 def test_what_is_no_image_of_the_stream_is_refused(scene, detector):
-    image, tracker = scene.view(), make_tracker(TrackingConfig(detector=detector))
+    image = scene.view()
+    tracker = make_tracker(TrackingConfig(detector=detector))
     with pytest.raises(InputError, match='start'):
         tracker.track(image)
     with pytest.raises(InputError, match='start'):

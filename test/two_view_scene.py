@@ -13,7 +13,8 @@ from rs_relpose_lab.experiments.problems import BASELINES, HEIGHT, LINE_DELAY, V
 from rs_relpose_lab.simulation.rows import in_both_views, measured, uniform_motion
 
 SIZE = (WIDTH - 1, HEIGHT - 1)
-GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
+GRAVITY_NOISE = np.radians(0.2)
+GYRO_NOISE = np.radians(0.1)
 DOWN = np.array([0.0, 1.0, 0.0])
 
 # Matches in pixels, measurements of the IMU, and the truth (velocities in baselines/s).
@@ -90,13 +91,15 @@ def make_scene(
     )
     p2 = BASELINES[direction] + rng.normal(size=3) * 0.2
     if pure_rotation:
-        p2, speed = np.zeros(3), 0.0
+        p2 = np.zeros(3)
+        speed = 0.0
     R1, R2 = Rotation.from_euler('xyz', rng.uniform(-10, 10, (2, 3)), degrees=True)
     v1 = speed * rng.choice([-1.0, 1.0], 3)
     v2 = -v1
     if constant_velocity:
         velocity = speed * np.sqrt(3.0) * p2 / np.linalg.norm(p2)
-        v1, v2 = R1.inv().apply(velocity), R2.inv().apply(velocity)
+        v1 = R1.inv().apply(velocity)
+        v2 = R2.inv().apply(velocity)
     w1 = rate * rng.choice([-1.0, 1.0], 3)
     w2 = -w1
     ends = rng.uniform([-4, -2, 8], [4, 2, 20], (2, 3)) if on_a_line else None
@@ -154,23 +157,28 @@ def make_minimal_problems(
         rng.uniform(*size, (count, 1)) * rng.choice([-1.0, 1.0], (count, 3))
         for size in (speed, rate)
     )
-    v2, w2 = -v1, -w1
+    v2 = -v1
+    w2 = -w1
     length = np.linalg.norm(p2, axis=1, keepdims=True)
     if constant_velocity:
         velocity = np.linalg.norm(v1, axis=1, keepdims=True) * p2 / length
-        v1, v2 = R1.inv().apply(velocity), R2.inv().apply(velocity)
+        v1 = R1.inv().apply(velocity)
+        v2 = R2.inv().apply(velocity)
     rays1, rays2 = np.empty((2, count * n, 3))
     tau1, tau2 = np.empty((2, count * n))
-    missing, owner = np.arange(count * n), np.repeat(np.arange(count), n)
+    missing = np.arange(count * n)
+    owner = np.repeat(np.arange(count), n)
     while len(missing):
         k = owner[missing]
         pixels = rng.uniform([0, 0], SIZE, (len(k), 2))
-        a, tau = VIEW.unproject(pixels), pixels[:, 1] * LINE_DELAY
+        a = VIEW.unproject(pixels)
+        tau = pixels[:, 1] * LINE_DELAY
         turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
         world = turn.apply(rng.uniform(6, 34, (len(k), 1)) * a) + (
             tau[:, None] * R1[k].apply(v1[k])
         )
-        second, rows = uniform_motion(R2[k], p2[k], w2[k], v2[k]), np.full(len(k), HEIGHT / 2)
+        second = uniform_motion(R2[k], p2[k], w2[k], v2[k])
+        rows = np.full(len(k), HEIGHT / 2)
         for _ in range(15):
             later = rows * LINE_DELAY
             b = second(world, later)

@@ -19,7 +19,8 @@ class PathNode(Node):
 
     def __init__(self):
         super().__init__('pose_chain')
-        self.pairs, self.chain = PairSynchronizer(), PoseChain()
+        self.pairs = PairSynchronizer()
+        self.chain = PoseChain()
         self.path, self.publisher = Path(), self.create_publisher(Path, '~/path', 10)
         for topic, kind in PAIR_TOPICS.items():
             self.create_subscription(

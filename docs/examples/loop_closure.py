@@ -51,7 +51,9 @@ def main(bag, parameter_file, *stamps):
 
 def read_bag(path, stamps):
     """Gray images of some stamps, the CameraInfo and all IMU samples; topics of the demo's bag."""
-    images, info, samples = {}, None, []
+    images = {}
+    info = None
+    samples = []
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():
             message = reader.deserialize(data, connection.msgtype)
@@ -59,7 +61,8 @@ def read_bag(path, stamps):
             if connection.topic == '/camera/camera_info':
                 info = message
             elif connection.topic == '/imu/data_raw':
-                w, a = message.angular_velocity, message.linear_acceleration
+                w = message.angular_velocity
+                a = message.linear_acceleration
                 samples.append(ImuSample(stamp, (w.x, w.y, w.z), (a.x, a.y, a.z)))
             elif connection.topic == '/camera/image_raw/compressed' and stamp in stamps:
                 images[stamp] = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)

@@ -20,7 +20,9 @@ PAUSE = 500_000
 
 def px4_fields(odometry):
     """Fields of px4_msgs/VehicleOdometry without frames and `timestamp`, float32 as there."""
-    stamp, pose, twist = odometry.header.stamp, odometry.pose.pose, odometry.twist.twist
+    stamp = odometry.header.stamp
+    pose = odometry.pose.pose
+    twist = odometry.twist.twist
     q = pose.orientation
     R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     of_pose, of_twist = (
@@ -46,7 +48,8 @@ class Px4Node(Node):
 
     def __init__(self):
         super().__init__('px4_odometry')
-        self.last, self.resets = None, 0
+        self.last = None
+        self.resets = 0
         from px4_msgs.msg import VehicleOdometry
 
         self.kind = VehicleOdometry
@@ -58,7 +61,8 @@ class Px4Node(Node):
     def receive(self, odometry):
         """Publish a state in the axes of PX4."""
         fields = px4_fields(odometry)
-        last, self.last = self.last, fields['timestamp_sample']
+        last = self.last
+        self.last = fields['timestamp_sample']
         self.resets += last is not None and not 0 < self.last - last < PAUSE
         self.publisher.publish(
             self.kind(

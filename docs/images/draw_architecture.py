@@ -62,9 +62,12 @@ BOX_HEIGHT = 42
 GAP = 26
 TOP = 48
 # Left edge and width of the three panels [px].
-LAYERS_AT, LAYERS_WIDTH = 16, 560
-PAIR_AT, PAIR_WIDTH = 600, 260
-COVARIANCE_AT, COVARIANCE_WIDTH = 884, 220
+LAYERS_AT = 16
+LAYERS_WIDTH = 560
+PAIR_AT = 600
+PAIR_WIDTH = 260
+COVARIANCE_AT = 884
+COVARIANCE_WIDTH = 220
 
 
 def imported_folders(folder: Path) -> set[str]:

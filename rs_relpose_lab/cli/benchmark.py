@@ -83,7 +83,8 @@ def run(args: argparse.Namespace) -> int:
 
 def matching_cells(patterns: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
     """Names that match any of the patterns: 'all', or with ``*`` as in file names."""
-    names, chosen = tuple(names), set[str]()
+    names = tuple(names)
+    chosen = set[str]()
     for pattern in patterns:
         matching = {name for name in names if pattern == 'all' or fnmatchcase(name, pattern)}
         if not matching:
@@ -538,7 +539,8 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
     cases = global_shutter.map_cases(args.walks, args.seed)
     configs = global_shutter.bag_configurations(args.bags, args.seed)
     with progress_bar(len(cases) + len(configs), 'recording') as bar:
-        maps, bags = [], []
+        maps = []
+        bags = []
         for case in cases:
             maps.append(global_shutter.map_errors(*case))
             bar.update()

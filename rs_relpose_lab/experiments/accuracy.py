@@ -72,7 +72,8 @@ def run_accuracy(
     path = kept / f'{hashlib.sha256(source).hexdigest()[:24]}.json'
     known = json.loads(path.read_text()) if path.is_file() else {}
     kept.mkdir(parents=True, exist_ok=True)
-    seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
+    seeds = range(run.first_seed, run.first_seed + run.trials)
+    chunk = 10
     tasks = [
         (
             run,
@@ -102,7 +103,8 @@ def _run(
 ) -> list[Trial]:
     """Some seeds of a cell, with the oracle's errors where they are known."""
     run, name, noise, seeds = task
-    cell, method = CELLS[name], replace(METHODS['auto'], solver=run.solver)
+    cell = CELLS[name]
+    method = replace(METHODS['auto'], solver=run.solver)
     trials = []
     for seed, known in seeds:
         problem = make_problem(cell, seed, noise)
@@ -216,8 +218,10 @@ def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
     def column(name: str) -> Array:
         return np.array([attrgetter(name)(cell) for cell in cells])
 
-    rotation, translation = column('rotation_ratio.median'), column('translation_ratio.median')
-    mean, above = column('nees.mean'), 100.0 * column('nees.above')
+    rotation = column('rotation_ratio.median')
+    translation = column('translation_ratio.median')
+    mean = column('nees.mean')
+    above = 100.0 * column('nees.above')
     return [
         ('ratio of median rotation errors, median over cells', _median(rotation), '<= 1.10'),
         ('ratio of median translation errors, median over cells', _median(translation), '<= 1.20'),

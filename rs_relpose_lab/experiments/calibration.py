@@ -56,7 +56,8 @@ def parts_of(tracks: TrackedPoints, seconds: float) -> Iterator[tuple[float, Tra
         inside = np.flatnonzero((times >= begin) & (times < begin + seconds))
         if not len(inside):
             continue
-        first, last = inside[0], inside[-1]
+        first = inside[0]
+        last = inside[-1]
         kept = (tracks.frames >= first) & (tracks.frames <= last)
         yield (
             begin,
@@ -129,7 +130,8 @@ def _quantities(
 ) -> Iterator[tuple[str, Estimate | None, float]]:
     """Name, estimate and factor to the unit of the name."""
     result = part.result
-    offset, longer = result.time_offset, interval - result.frame_interval
+    offset = result.time_offset
+    longer = interval - result.frame_interval
     if slope is not None:
         offset = Estimate(
             offset.value + slope.value * longer,

@@ -136,7 +136,8 @@ def _gyro(
 def _world(rng: np.random.Generator) -> Array:
     """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
     count = 4000
-    azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
+    azimuth = rng.uniform(-1.9, 1.9, count)
+    elevation = rng.uniform(-1.0, 0.9, count)
     distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
     direction = np.stack(
         [
@@ -165,8 +166,12 @@ def _frames(
     )
     path = FinePath(trajectory, times[0] - 0.1, times[-1] + 0.15)
     ids = np.full(len(world), -1, dtype=np.int64)  # track of a point that is followed
-    drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
-    next_id, frame, track, pixels = 0, [], [], []
+    drift = np.zeros((len(world), 2))
+    start = np.zeros(len(world))
+    next_id = 0
+    frame = []
+    track = []
+    pixels = []
     for index, time in enumerate(times):
         points = observe(world, path.motion_from(time), view, margin=-2.0)
         visible = np.isfinite(points).all(axis=1)

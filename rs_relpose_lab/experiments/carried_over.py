@@ -57,11 +57,15 @@ def carried_over(
             f'{protocol.truth} has no path of the camera: give a folder with global_truth.csv, '
             'whose pairs are those of the keyframe policy'
         )
-    begin_ns, images, bags = 0, None, protocol.calibrated
+    begin_ns = 0
+    images = None
+    bags = protocol.calibrated
     if not bags:
         stamps = image_stamps(protocol.scored)
         half = len(stamps) // 2
-        begin_ns, images, bags = stamps[half], range(half), (protocol.scored,)
+        begin_ns = stamps[half]
+        images = range(half)
+        bags = (protocol.scored,)
     text = _calibration_of(bags, images, lens_known)
     file = folder / f'{protocol.scored.name}_{protocol.name.replace(" ", "_")}.yaml'
     file.write_text(text, encoding='utf-8')

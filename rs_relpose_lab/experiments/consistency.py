@@ -33,7 +33,8 @@ from rs_relpose_ros.offline.replay import read_truth as truth_of_bag
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 
-R_FREEDOM, T_FREEDOM = 3, 2
+R_FREEDOM = 3
+T_FREEDOM = 2
 # Of the errors of poses within their covariance.
 QUANTILE = 0.997
 # Of keyframes [px]: the default's, and one that makes pairs of about twice the interval.
@@ -42,10 +43,12 @@ PARALLAXES = (12.0, 30.0)
 STILL = 0.03
 # Longest interval of a short pair [s].
 SHORT = 0.25
-SIMULATED, RECORDED = 'simulated', 'recordings'
+SIMULATED = 'simulated'
+RECORDED = 'recordings'
 # In comparison on recordings: the same parameters but for these, and OpenCV's 5-point on the same
 # matches with this threshold [px].
-NO_READOUT, MAGSAC = 'readout ignored', 'MAGSAC'
+NO_READOUT = 'readout ignored'
+MAGSAC = 'MAGSAC'
 IGNORE_READOUT = {'readout_time': 0.0, 'withhold_when_wrong': False}
 THRESHOLD = 1.0
 # Covariance of the truth of a simulation.
@@ -164,7 +167,8 @@ def on_recording(
     pairs are those of the keyframe policy. `compare`: also with a readout time of 0, and OpenCV's
     5-point on the same matches.
     """
-    parameters, known = read_parameters(parameter_file), read_truth(truth)
+    parameters = read_parameters(parameter_file)
+    known = read_truth(truth)
     methods: dict[str, Method] = {RECORDED: lambda pair, _: pair.pose}
     runs = [(parameters, methods)]
     if compare:
@@ -239,7 +243,8 @@ def chosen_pairs(
     tracks or gyro are lost is left out.
     """
     following = dict(itertools.pairwise([0, *image_stamps(path)]))
-    keyframes, wanted = frozenset(itertools.chain.from_iterable(ends)), set(ends)
+    keyframes = frozenset(itertools.chain.from_iterable(ends))
+    wanted = set(ends)
     within = {s for s in following if any(begin < s < end for begin, end in ends)}
     at_once, never = (
         parameters.updated(policy)
@@ -339,7 +344,8 @@ def _line(name: str, pairs: Sequence[PairConsistency]) -> tuple[str, ...]:
         (R_FREEDOM, [p.rotation_nees for p in answered]),
         (T_FREEDOM, [p.translation_nees for p in answered]),
     ):
-        law, squares = chi2(freedom), freedom * np.array(values)
+        law = chi2(freedom)
+        squares = freedom * np.array(values)
         if np.isnan(squares).all():  # a method without covariance
             cells += 3 * ['-']
             continue

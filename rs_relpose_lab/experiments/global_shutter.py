@@ -69,7 +69,9 @@ class MapErrors:
 def swinging(rate: float, seconds: float) -> Trajectory:
     """A camera that swings about a point, mostly about the vertical; largest rate [rad/s]."""
     # Of the rate, about the other axes.
-    spacing, frequency, tilt = 0.02, 1.1, 0.3
+    spacing = 0.02
+    frequency = 1.1
+    tilt = 0.3
     times = np.arange(-1.0, seconds + 1.0, spacing)
     phase = 2.0 * np.pi * frequency * times
     swing = rate / (2.0 * np.pi * frequency) / np.hypot(1.0, tilt) * np.sin(phase)
@@ -86,9 +88,11 @@ def derotated_frames(
     simulation: Simulation, parameters: Parameters, *, images: bool = False
 ) -> Iterator[tuple[int, GlobalShutterFrame]]:
     """Number and derotated frame of each image; black images where none are rendered."""
-    config, camera = simulation.config, simulation.camera
+    config = simulation.config
+    camera = simulation.camera
     loop = unrolling_loop(parameters, offline=True)
-    samples, fed = simulation.imu.samples(), 0
+    samples = simulation.imu.samples()
+    fed = 0
     black = np.zeros((config.height, config.width), dtype=np.uint8)
     for index in range(config.frame_count):
         until = int(
@@ -306,7 +310,8 @@ def bag_configurations(bags: int, first_seed: int) -> list[SimulationConfig]:
 SIZES = ((640, 480), (1280, 720))
 
 _FRAMES = 150
-_FRAME_NS, _IMU_NS = NANOSECONDS // 30, NANOSECONDS // 200
+_FRAME_NS = NANOSECONDS // 30
+_IMU_NS = NANOSECONDS // 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +345,8 @@ def frame_times(width: int, height: int) -> Speed:
     )
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, width * height, dtype=np.uint8).reshape(height, width)
-    times, stamp_ns = [], 0
+    times = []
+    stamp_ns = 0
     for frame in range(1, _FRAMES + 1):
         while stamp_ns < frame * _FRAME_NS + NANOSECONDS // 25:
             rate = 2.0 * np.sin(1e-9 * stamp_ns * np.array([7.0, 5.0, 3.0]))

@@ -38,7 +38,8 @@ _WITHIN = 2.0
 # [chosen: beyond the seeds of all bags of one run]
 _OTHER_SEED = 10_000
 # Focal length over that assumed by `calibrate`, 0.8 widths; error of the principal point [px].
-FOCAL, CENTER = (0.8, 1.2), 10.0
+FOCAL = (0.8, 1.2)
+CENTER = 10.0
 # Quantities of the lens in the report. The displacement by k1, k2, k3 is that of the image's
 # corner, and the principal point that of the coordinate that is further off.
 LENS = ('focal length [%]', 'displacement of the corner [%]', 'principal point [px]')
@@ -90,7 +91,8 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         readout_time=round(rng.uniform(0.012, 0.032), 4),
         time_offset=round(rng.uniform(-0.08, 0.08), 4),
     )
-    camera, shift = config.camera, rng.uniform(-CENTER, CENTER, 2)
+    camera = config.camera
+    shift = rng.uniform(-CENTER, CENTER, 2)
     camera = replace(
         camera,
         cx=0.5 * (camera.width - 1) + shift[0],
@@ -215,7 +217,8 @@ def on_lens(
 
 
 def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float, float]]:
-    sensor, imu = found.sensor, found.imu
+    sensor = found.sensor
+    imu = found.imu
     assert sensor.readout_time is not None
     turn = Rotation.from_matrix(sensor.R_cam_imu @ truth.R_cam_imu.T).as_rotvec()
     bias = np.array(imu.gyro_bias) - truth.gyro_bias
@@ -228,7 +231,8 @@ def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float
 
 
 def _of_lens(found: Parameters, truth: RollingShutterCamera) -> dict[str, tuple[float, float]]:
-    sigmas, lens = found.intrinsics, found.intrinsics.of_image(truth.width, truth.height)
+    sigmas = found.intrinsics
+    lens = found.intrinsics.of_image(truth.width, truth.height)
     center = max(abs(lens.cx - truth.cx), abs(lens.cy - truth.cy))
     radius = corner_radius(truth)
     coefficients = lens.global_shutter_camera().radial_coefficients - truth.radial_coefficients
@@ -317,7 +321,8 @@ def _cells(runs: Sequence[LensRun]) -> list[str]:
         ' / '.join(f'{ratio:.2f}' for ratio in ratios),
     ]
     for found in ([run.calibrated for run in runs], [run.truth for run in runs]):
-        pairs, count = sum(poses.pairs for poses in found), sum(poses.count for poses in found)
+        pairs = sum(poses.pairs for poses in found)
+        count = sum(poses.count for poses in found)
         t, R = (
             sum(getattr(poses, name) * poses.count for poses in found) / max(count, 1)
             for name in ('beyond_t', 'beyond_r')

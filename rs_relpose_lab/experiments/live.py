@@ -186,13 +186,16 @@ def run_cell(
 def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStatistics:
     """Statistics of a run."""
     frames = _read_frames(run.timings)
-    paired, posed = frames['outcome'] != 'none', frames['outcome'] == Status.OK.value
+    paired = frames['outcome'] != 'none'
+    posed = frames['outcome'] == Status.OK.value
     latency = (frames['done_ns'] - frames['ready_ns']) / 1e6
     log = np.load(run.log)
-    images, imu = log[log['is_image']], log[~log['is_image']]
+    images = log[log['is_image']]
+    imu = log[~log['is_image']]
     refused = {reason: int(run.counters[f'frames_refused_{reason.value}']) for reason in Refusal}
     rotation, translation = errors(run.poses)
-    first, end = run.metrics[0], run.metrics[-1]
+    first = run.metrics[0]
+    end = run.metrics[-1]
     return LiveStatistics(
         cell=cell.name,
         duration=duration,

@@ -51,7 +51,8 @@ def run_case(case: 'Case', folder: Path) -> CaseRun:
     assert truth is not None
     by_stamp = {stamp_ns(item.header): time_ns(item.time_ref) for item in references}
     known = {stamp_ns(item.header): item for item in poses}
-    beyond, limits = 0, chi2([2, 3]).ppf(QUANTILE)
+    beyond = 0
+    limits = chi2([2, 3]).ppf(QUANTILE)
     for stamp in by_stamp.keys() & known.keys():
         pair = truth.relative_pose(
             *(at - case.jump_ns * (not truth.covers(at)) for at in (by_stamp[stamp], stamp))

@@ -168,7 +168,8 @@ def prepared(method: Method, problem: PairProblem, seed: int) -> Estimate:
     if method.continuous_gyro:
         assert problem.gyro is not None, f'{method.label} needs a pair with a continuous gyro'
         motions = problem.gyro.motion1, problem.gyro.motion2
-    points, middle = [problem.points1, problem.points2], (np.eye(3), np.eye(3))
+    points = [problem.points1, problem.points2]
+    middle = (np.eye(3), np.eye(3))
     if method.derotated:
         points, middle = _derotated(points, problem.camera, motions)
     pixels = [undistorted(p, problem.camera) for p in points]
@@ -196,7 +197,9 @@ def run_method(name: str, problem: PairProblem, seed: int) -> tuple[Status, Pose
 
 
 def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimate:
-    motion1, motion2, gyro = problem.motion1, problem.motion2, None
+    motion1 = problem.motion1
+    motion2 = problem.motion2
+    gyro = None
     config = replace(
         problem.configured,
         solver=method.solver,
@@ -206,7 +209,8 @@ def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimat
     if method.continuous_gyro:
         gyro = problem.gyro
         assert gyro is not None, f'{method.label} needs a pair with a continuous gyro'
-        motion1, motion2 = gyro.motion1, gyro.motion2
+        motion1 = gyro.motion1
+        motion2 = gyro.motion2
         config = replace(config, gyro_sigma=gyro.rate_sigma)
         if gyro.gravity_sigma is not None:
             config = replace(config, gravity_sigma=min(gyro.gravity_sigma, 1.5))

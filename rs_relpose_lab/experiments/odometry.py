@@ -110,7 +110,8 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
         zeros,
         trust_runs.TrackNoise(white=0.0),
     )
-    delay_ns, shape = to_nanoseconds(IMAGE_DELAY), (_CAMERA.height, _CAMERA.width)
+    delay_ns = to_nanoseconds(IMAGE_DELAY)
+    shape = (_CAMERA.height, _CAMERA.width)
     recording = Recording(
         Source(NAME, trust_runs.TRACKS),
         configured,
@@ -146,7 +147,8 @@ def _corners(text: str) -> tuple[int, NDArray[np.int64], Array] | None:
 # -- paths against the truth ------------------------------------------------------------------
 
 # Lengths of the walks [s].
-SHORT, LONG = 30.0, 300.0
+SHORT = 30.0
+LONG = 300.0
 # Part of a path that is aligned before its end is compared [s].
 _ALIGNED = 5.0
 
@@ -225,7 +227,8 @@ def on_recording(
     started = time.thread_time()
     live = offline.follow(estimator, feed.pairs, feed.samples)
     processor = time.thread_time() - started
-    smoothed, nees = estimator.smoothed(), (math.nan,) * 3
+    smoothed = estimator.smoothed()
+    nees = (math.nan,) * 3
     if isinstance(truth, TrueStates):
         states = list(published(OdometryEstimator(parameters), feed))
         chi = odometry_disturbances.errors_squared(states, smoothed[0], truth)

@@ -35,9 +35,11 @@ from rs_relpose_ros.odometry.states import ContinuousPath, Odometry, OdometrySta
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
 # Before and after a disturbance [s]; afterwards all is to be normal again [s].
-_MARGIN, NORMAL_AGAIN = 6.0, 2.0
+_MARGIN = 6.0
+NORMAL_AGAIN = 2.0
 # Period of the published states [ns]; quantile of chi squared of 3 degrees of freedom.
-_PERIOD_NS, BEYOND = 33_333_333, float(chi2.ppf(0.997, 3))
+_PERIOD_NS = 33_333_333
+BEYOND = float(chi2.ppf(0.997, 3))
 # Time without a sample after which odometry_node reports it [ns].
 _SILENT_NS = 250_000_000
 
@@ -119,13 +121,17 @@ def _other_sightings(
 
     Its corners, and those after it, are other ones than before.
     """
-    count, last = len(known.slips), first + len(seconds)
+    count = len(known.slips)
+    last = first + len(seconds)
     if (what.corners, what.white, what.lost, what.object_speed) == (1.0, 1.0, 0.0, 0.0):
         return known
-    ids, pixels, noise = list(known.ids), list(known.pixels), list(known.noise)
+    ids = list(known.ids)
+    pixels = list(known.pixels)
+    noise = list(known.noise)
     in_sight = rng.uniform(size=count) < what.corners
     # Time at which an object's corner appears; NaN for corners of the scene.
-    appeared, known_until = np.full(count, np.nan), np.zeros(count, dtype=bool)
+    appeared = np.full(count, np.nan)
+    known_until = np.zeros(count, dtype=bool)
     for k, at in zip(range(first, last), seconds, strict=True):
         kept = in_sight[ids[k]] & (rng.uniform(size=len(ids[k])) >= what.lost)
         kept[:1] = True  # a tracker of nothing has no image
@@ -203,8 +209,11 @@ def true_states(simulation: Simulation) -> TrueStates:
 
 def published(estimator: OdometryEstimator, feed: Feed) -> Iterator[Odometry]:
     """States that odometry_node publishes: at 30 Hz, each pair being processed when it arrives."""
-    path, waiting, next_ns = ContinuousPath(estimator.propagated), list(feed.pairs[::-1]), 0
-    frames, last_ns = feed.frames[::-1], feed.samples[0][0]
+    path = ContinuousPath(estimator.propagated)
+    waiting = list(feed.pairs[::-1])
+    next_ns = 0
+    frames = feed.frames[::-1]
+    last_ns = feed.samples[0][0]
     for arrives_ns, sample in feed.samples:
         if arrives_ns - last_ns > _SILENT_NS:
             estimator.imu_is_silent(seconds_between(last_ns, arrives_ns))
@@ -294,7 +303,8 @@ def measure(task: tuple[str, int]) -> DisturbedRun:
     """A disturbance on the walk of a seed."""
     name, seed = task
     what = DISTURBANCES[name]
-    simulation, rng = simulate(configuration(what, seed)), np.random.default_rng(seed)
+    simulation = simulate(configuration(what, seed))
+    rng = np.random.default_rng(seed)
     feed = feed_of(disturbed(trust_runs.walk_of(simulation, rng), simulation, what, rng))
     return on_feed(name, seed, feed, true_states(simulation))
 
@@ -319,7 +329,8 @@ def on_feed(name: str, seed: int, feed: Feed, truth: TrueStates) -> DisturbedRun
         raise InputError(f'{name}, seed {seed}: odometry did not start')
     beyond = errors_squared(states, smoothed[0], truth) > BEYOND
     at = np.array([_seconds(state.imu_ns) for state in states])
-    begin, end = _MARGIN, _MARGIN + DISTURBANCES[name].seconds
+    begin = _MARGIN
+    end = _MARGIN + DISTURBANCES[name].seconds
     before = _sigmas(states, at, begin - 0.5)
     after = _sigmas(states, at, end + NORMAL_AGAIN)
     used = max(

@@ -36,7 +36,8 @@ from rs_relpose_ros.pipeline.pipeline import FrameLoop
 from rs_relpose_ros.pipeline.warm_up import warm_up
 
 # Length of the walks [s]; probability of an error beyond 3 sigma.
-SECONDS, _BEYOND = 60.0, 0.0027
+SECONDS = 60.0
+_BEYOND = 0.0027
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,8 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     recording = trust_runs.walk_of(simulation, np.random.default_rng(config.seed))
     parameters = Parameters.from_mapping(recording.configured.values)
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
-    pairs, views = [], {}
+    pairs = []
+    views = {}
     for pair, _ in trust_runs.run(recording, recording.configured):
         given = PublishedPair.of_result(pair)
         views[given.current_imu_ns + row_ns(given)] = pair.stamp_ns, pair.parallax
@@ -150,7 +152,8 @@ def _related(
 
 def _errors(path: Sequence[Odometry], truth: TrueTrajectory) -> tuple[float, float, float]:
     """Position [m] and rotation [deg] of the last pose in the first one's frame, and ATE [m]."""
-    first, last = path[0], path[-1]
+    first = path[0]
+    last = path[-1]
     true = truth.relative_pose(first.imu_ns, last.imu_ns)
     errors = path_of(path, truth).errors
     if true is None or errors is None:

@@ -98,15 +98,11 @@ def _metrics(
     states = [state for state in states if rows is not None and rows.covers(state.imu_ns)]
     if rows is not None and len(states) > 3:
         truth = _true_states(rows, feed)
-        first, numbers = (
-            states[0],
-            np.searchsorted(truth.stamps_ns, [state.imu_ns for state in states]),
-        )
+        first = states[0]
+        numbers = np.searchsorted(truth.stamps_ns, [state.imu_ns for state in states])
         start = seconds_between(with_direction[0], first.imu_ns)
-        claimed, along = (
-            estimator.starts[0].scale_sigma,
-            first.velocity / np.linalg.norm(first.velocity),
-        )
+        claimed = estimator.starts[0].scale_sigma
+        along = first.velocity / np.linalg.norm(first.velocity)
         speed = float(
             (np.linalg.norm(first.velocity) - np.linalg.norm(truth.velocity[numbers[0]]))
             / math.sqrt(along @ first.velocity_covariance[:3, :3] @ along)
@@ -114,7 +110,8 @@ def _metrics(
         of_path = truth.trajectory
         errors = path_of(states, of_path).errors
         assert errors is not None
-        scale, end = 100.0 * errors.scale_error, drift(states, of_path)
+        scale = 100.0 * errors.scale_error
+        end = drift(states, of_path)
         chi = odometry_disturbances.errors_squared(states, estimator.smoothed()[0], truth)[:, 0]
         beyond = 100.0 * float((chi > _BEYOND).mean())
         step = max(

@@ -35,7 +35,10 @@ Values = NDArray[Any]  # real, or complex under a complex step
 
 # Unknowns, as a step from a start: rotation of R (3), tangent of t (2), tangent of gravity (2),
 # gyro corrections (6), velocities (6; left out where both cameras rest).
-_POSE, _GRAVITY, _GYRO, _VELOCITY = slice(0, 5), slice(5, 7), slice(7, 13), slice(13, 19)
+_POSE = slice(0, 5)
+_GRAVITY = slice(5, 7)
+_GYRO = slice(7, 13)
+_VELOCITY = slice(13, 19)
 _STEP = 1e-30
 
 
@@ -100,7 +103,8 @@ class Objective:
 
     def residuals(self, x: Values) -> Values:
         """Residuals (M, K) in sigmas at each column of x (P, K)."""
-        problem, spread = self.problem, self.velocity_spread
+        problem = self.problem
+        spread = self.velocity_spread
         use = ~problem.is_outlier
         R, t, gravity = pose_at(self.start, x)
         gravity2 = np.einsum('jik,jk->ik', R, gravity)
@@ -196,11 +200,13 @@ def _sampson(
     (f1, f1_u, f1_v), tau1 = _derotated(points1, w1)
     (f2, f2_u, f2_v), tau2 = _derotated(points2, w2)
     f2, f2_u, f2_v = (np.einsum('ijk,jkn->ikn', R, f) for f in (f2, f2_u, f2_v))
-    d1, d2 = v1[:, :, None], np.einsum('ijk,jk->ik', R, v2)[:, :, None]
+    d1 = v1[:, :, None]
+    d2 = np.einsum('ijk,jk->ik', R, v2)[:, :, None]
     baseline = t[:, :, None] + tau2 * d2 - tau1 * d1
     normal = _cross(f1, f2)
     e = _dot(normal, baseline)
-    towards1, towards2 = _cross(f2, baseline), _cross(baseline, f1)
+    towards1 = _cross(f2, baseline)
+    towards2 = _cross(baseline, f1)
     e_u1 = _dot(towards1, f1_u)
     e_v1 = _dot(towards1, f1_v) - LINE_DELAY * _dot(normal, d1)
     e_u2 = _dot(towards2, f2_u)
@@ -218,7 +224,8 @@ def _derotated(points: Array, w: Values) -> tuple[tuple[Values, Values, Values],
             np.ones(len(points)),
         ]
     )[:, None]
-    along_u, along_v = np.array([1.0, 0.0, 0.0]) / FOCAL, np.array([0.0, 1.0, 0.0]) / FOCAL
+    along_u = np.array([1.0, 0.0, 0.0]) / FOCAL
+    along_v = np.array([0.0, 1.0, 0.0]) / FOCAL
     series = _series(w, tau)
     f = _rotate(w, m, series)
     f_u = _rotate(w, along_u[:, None, None], series)
@@ -235,11 +242,13 @@ def _series(w: Values, tau: Array) -> tuple[Values, Values]:
     square = (w * w).sum(axis=0)[:, None] * (tau * tau)
     sine_term = np.broadcast_to(tau, square.shape)
     cosine_term = 0.5 * tau * sine_term
-    sine, cosine = sine_term, cosine_term
+    sine = sine_term
+    cosine = cosine_term
     for k in range(1, 9):
         sine_term = -sine_term * square / ((2 * k) * (2 * k + 1))
         cosine_term = -cosine_term * square / ((2 * k + 1) * (2 * k + 2))
-        sine, cosine = sine + sine_term, cosine + cosine_term
+        sine = sine + sine_term
+        cosine = cosine + cosine_term
     return sine, cosine
 
 

@@ -125,7 +125,8 @@ class SimulatedSequence:
     """A sequence whose points and IMU are simulated; frame k is taken at the k-th true pose."""
 
     def __init__(self, folder: Path, name: str, run: PennCosyvioRun) -> None:
-        self._name, self._run = name, run
+        self._name = name
+        self._run = run
         self._camera = read_camera(folder, run.readout_time)
         self._clock = ImageClock(self._camera)
         self._stamps_ns, *poses = read_poses(folder, name)
@@ -197,7 +198,8 @@ class SimulatedSequence:
         start_ns, end_ns = self._clock.exposed_span_ns(stamp_ns)
         # The paper: 'an average of the inertial measurements within 0.1 s near the image frame'.
         # Here it is centred on the middle row.
-        middle_ns, half_ns = (start_ns + end_ns) // 2, to_nanoseconds(0.05)
+        middle_ns = (start_ns + end_ns) // 2
+        half_ns = to_nanoseconds(0.05)
         window = self._samples[
             bisect_left(self._sample_stamps, middle_ns - half_ns) : bisect_right(
                 self._sample_stamps, middle_ns + half_ns
@@ -243,7 +245,8 @@ class SimulatedSequence:
         )
 
     def _points(self, number: int, seconds: list[float]) -> tuple[Array, Array]:
-        view, rng = view_of(self._camera), self._stream(_POINTS, number)
+        view = view_of(self._camera)
+        rng = self._stream(_POINTS, number)
         (start, _), (origin, _) = self._motion.at(seconds)
 
         def candidates() -> Array:

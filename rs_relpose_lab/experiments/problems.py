@@ -31,9 +31,11 @@ from rs_relpose_lab.simulation.rows import (
 
 Noise = Literal['paper', 'gaussian']
 
-WIDTH, HEIGHT = 1920, 1080
+WIDTH = 1920
+HEIGHT = 1080
 FOCAL = 640.0
-CENTRE_U, CENTRE_V = 959.5, 539.5
+CENTRE_U = 959.5
+CENTRE_V = 539.5
 LINE_DELAY = 60e-6
 
 VIEW = View(
@@ -137,7 +139,8 @@ def make_problem(
     velocity2 = -velocity1
     if cell.constant_velocity:
         along = np.sqrt(3.0) * cell.speed * baseline / length
-        velocity1, velocity2 = attitude1.inv().apply(along), attitude2.inv().apply(along)
+        velocity1 = attitude1.inv().apply(along)
+        velocity2 = attitude2.inv().apply(along)
     rate1 = cell.rate * rng.choice([-1.0, 1.0], 3)
     rate2 = -rate1
 
@@ -163,7 +166,8 @@ def make_problem(
         tilts = rng.normal(size=(2, 3))
     tilt1, tilt2 = Rotation.from_rotvec(np.radians(cell.gravity_noise) * tilts)
     down = np.array([0.0, 1.0, 0.0])
-    gravity1, gravity2 = attitude1.inv().apply(down), attitude2.inv().apply(down)
+    gravity1 = attitude1.inv().apply(down)
+    gravity2 = attitude2.inv().apply(down)
     return TwoViewProblem(
         points1=points1,
         points2=points2,

@@ -29,7 +29,10 @@ Times = NDArray[np.int64]
 
 # Interval of rotations that are compared [s]; frames that are rendered, their least motion over
 # the rows [px] at a depth of 4 m.
-_WITHIN, _RENDERED, _LEAST_MOTION, _DEPTH = 0.5, 4, 3.0, 4.0
+_WITHIN = 0.5
+_RENDERED = 4
+_LEAST_MOTION = 3.0
+_DEPTH = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,8 @@ def on_walk(config: SimulationConfig) -> RowMetrics:
     """Poses of rows of a simulated recording."""
     simulation = simulate(config)
     recording = walk_of(simulation, np.random.default_rng(config.seed))
-    parameters, feed = Parameters.from_mapping(recording.configured.values), feed_of(recording)
+    parameters = Parameters.from_mapping(recording.configured.values)
+    feed = feed_of(recording)
     estimator = OdometryEstimator(parameters, keep=True)
     follow(estimator, feed.pairs, feed.samples)
     paths = estimator.smoothed_paths()
@@ -109,7 +113,8 @@ def _position_error(
 
 def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -> float:
     """Root mean square [deg] of rotations over up to half a second."""
-    R, true = rows.pose(times)[0], simulation.states(times).R_world_cam
+    R = rows.pose(times)[0]
+    true = simulation.states(times).R_world_cam
     later = np.searchsorted(times, times + round(_WITHIN * NANOSECONDS)) - 1
     steps = [np.einsum('nji,njk->nik', one, one[later]) for one in (R, true)]
     angles = Rotation.from_matrix(np.einsum('nji,njk->nik', *steps)).magnitude()
@@ -120,7 +125,8 @@ def _rendered(
     simulation: Simulation, rows: RowTrajectory, times: Sequence[Times], A: Array, t: Array
 ) -> tuple[float, float]:
     """Ratios of the gray differences, of frames with enough motion."""
-    sums, config = np.zeros((2, 2)), simulation.config
+    sums = np.zeros((2, 2))
+    config = simulation.config
     stamps = np.column_stack(times)
     truth = simulation.states(stamps.ravel())
     R_true = truth.R_world_cam.reshape(*stamps.shape, 3, 3)

@@ -129,7 +129,8 @@ def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
 
 def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing]) -> str:
     """Write runs, tables, plot and report into a folder; the report."""
-    compared, scaled = method_statistics(comparison), method_statistics(scaling)
+    compared = method_statistics(comparison)
+    scaled = method_statistics(scaling)
     write_csv(folder / 'runs.csv', [*comparison, *scaling])
     write_csv(folder / 'methods.csv', compared)
     write_csv(folder / 'scaling.csv', scaled)
@@ -174,7 +175,8 @@ def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing]) -> 
 
 def _scaling_table(scaling: Sequence[Timing]) -> str:
     """Median times, and the slope of log time over log matches: 1 is linear."""
-    sizes, rows = sorted({timing.matches for timing in scaling}), []
+    sizes = sorted({timing.matches for timing in scaling})
+    rows = []
     for method, timings in grouped(scaling, attrgetter('method')).items():
         times = [
             float(np.median([one.duration for one in timings if one.matches == size]))

@@ -115,7 +115,8 @@ def on_recording(path: Path, parameter_file: Path) -> list[Suggestion]:
     results = [Suggestion(path.name, 'right', 0.0, 0.0, others=' '.join(found))]
     for name, wrong in ROWS.items():
         named, _ = _findings(path, parameters.updated(wrong.values(parameters)))
-        reference, last = correct.get(wrong.quantity), named.pop(wrong.quantity, None)
+        reference = correct.get(wrong.quantity)
+        last = named.pop(wrong.quantity, None)
         # An angle has the error itself as its estimate.
         right = {
             'axes': wrong.error(0.0),

@@ -25,7 +25,8 @@ from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 # Of simulated bags.
 MOTIONS = ('hand-held', 'vehicle')
 # Beyond these lie 0.27 % of right poses: three sigmas of one dimension.
-LIMIT_T, LIMIT_R = 11.8, 14.2
+LIMIT_T = 11.8
+LIMIT_R = 14.2
 # Seconds that a run continues after its error should have been flagged.
 _AFTERWARDS = 3.0
 # Focal length for which the scene's textures are made where tracks need none [px].
@@ -240,7 +241,8 @@ def bag_row(
     pairs: Sequence[trust_runs.EvaluatedPair],
 ) -> BagRow:
     """Result of a row; `informative`: which seconds of the recording are, for its error."""
-    row, source = ROWS[name], recording.source
+    row = ROWS[name]
+    source = recording.source
     clocks = [_clock(informative, pair.at) for pair in pairs]
     flags = [
         (clock, pair)
@@ -255,7 +257,8 @@ def bag_row(
         for clock, pair in zip(clocks, pairs, strict=True)
         if pair.has_pose and pair.state not in trust_runs.FLAGGED
     ]
-    every, later = [p for _, p in published], [p for clock, p in published if clock > 1.0]
+    every = [p for _, p in published]
+    later = [p for clock, p in published if clock > 1.0]
     counted = later if name != RIGHT else every
     seconds = _clock(informative, recording.seconds)
     return BagRow(

@@ -23,7 +23,8 @@ from rs_relpose_ros.imu.buffer import ImuSample
 Gray = NDArray[np.uint8]
 
 # Informative seconds of motion within which an error must be flagged.
-GROSS, SMALL = 5, 15
+GROSS = 5
+SMALL = 15
 # Quantities of the laboratory's information, and their number of unknowns.
 QUANTITIES: Mapping[str, int] = {
     'axes': 3,
@@ -393,7 +394,8 @@ _BEFORE = np.repeat([0.5, 0.1, 0.05, 0.1, 0.2, 0.3, 0.3], list(QUANTITIES.values
 # Velocities differ from t / interval by so many baselines per second, 1 sigma.
 _VELOCITY_SIGMA = 1.0
 # Least noise of a match [px] and of a rotation by the gyro [rad]: no model is better.
-_LEAST_PIXEL, _LEAST_ROTATION = 0.05, 3e-4
+_LEAST_PIXEL = 0.05
+_LEAST_ROTATION = 3e-4
 # An injected error must be so many times its sigma.
 INFORMATIVE = 5.0
 # Share of that information that an informative second must have itself.
@@ -426,8 +428,10 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> tuple[Arra
     unknowns = _UNKNOWNS + _FREE
     residuals = _Residuals(pair, camera)(_STEP * np.eye(unknowns + 1, unknowns, -1))
     jacobian = (residuals[1:] - residuals[0]).T / _STEP
-    by_x, by_c = jacobian[:, :_UNKNOWNS], jacobian[:, _UNKNOWNS:]
-    H, mixed = by_x.T @ by_x, by_x.T @ by_c
+    by_x = jacobian[:, :_UNKNOWNS]
+    by_c = jacobian[:, _UNKNOWNS:]
+    H = by_x.T @ by_x
+    mixed = by_x.T @ by_c
     # By the images alone, without the last three residuals, which are the gyro's.
     by_images = by_x[:-3].T @ by_x[:-3]
     information = np.linalg.inv(np.linalg.inv(by_images)[:3, :3])
@@ -468,8 +472,10 @@ class _Residuals:
 
     def __call__(self, unknowns: Array) -> Array:
         """Residuals (K, M) of unknowns (K, 22)."""
-        x, c = unknowns[:, :_UNKNOWNS], unknowns[:, _UNKNOWNS:]
-        pair, count = self._pair, len(unknowns)
+        x = unknowns[:, :_UNKNOWNS]
+        c = unknowns[:, _UNKNOWNS:]
+        pair = self._pair
+        count = len(unknowns)
         t = pair.t + x[:, 3:5] @ self._tangent
         d = x[:, 5:].reshape(count, 2, 3)
         R = Rotation.from_rotvec(x[:, :3]).as_matrix() @ pair.R

@@ -50,7 +50,8 @@ Ids = NDArray[np.int64]
 PointMap = Callable[[Array], Array]
 
 # Corners in sight, of which a tracker takes its 300; least distance between new ones [px].
-_IN_SIGHT, _LEAST_DISTANCE = 420, 10.0
+_IN_SIGHT = 420
+_LEAST_DISTANCE = 10.0
 # Share of the corners that are lost from frame to frame, though in sight.
 _LOST = 0.01
 # Corners keep away from the image's border by half a window [px].
@@ -104,11 +105,15 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
     view = view_of(camera)
     ids: Ids = np.empty(0, dtype=np.int64)
     world = np.empty((0, 3))
-    observed_ids, observed_pixels, following = [], [], 0
+    observed_ids = []
+    observed_pixels = []
+    following = 0
     for time in times:
         pixels = observe(world, path.motion_from(time), view, margin=-_BORDER)
         kept = np.isfinite(pixels).all(axis=1) & (rng.uniform(size=len(ids)) >= _LOST)
-        ids, world, pixels = ids[kept], world[kept], pixels[kept]
+        ids = ids[kept]
+        world = world[kept]
+        pixels = pixels[kept]
         new = _new_corners(rng, pixels, camera.width, camera.height)
         pixels = np.concatenate([pixels, new])
         there, hits = simulation.renderer.locate(time, pixels)
@@ -117,7 +122,9 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
         world = np.concatenate([world, there[len(world) :]])
         # Not where another surface hides it, nor where there is no surface.
         kept = (hits >= 0) & (np.linalg.norm(there - world, axis=1) < _HIDDEN)
-        ids, world, pixels = ids[kept], world[kept], pixels[kept]
+        ids = ids[kept]
+        world = world[kept]
+        pixels = pixels[kept]
         observed_ids.append(ids)
         observed_pixels.append(pixels)
     positions = simulation.trajectory.poses(times)[0]
@@ -170,7 +177,9 @@ class SimulatedTracker:
     """
 
     def __init__(self, sightings: Sightings, published: PointMap, most: int) -> None:
-        self._sightings, self._published, self._most = sightings, published, most
+        self._sightings = sightings
+        self._published = published
+        self._most = most
         self._ids = TrackIds()
         self.reset()
 
@@ -184,7 +193,8 @@ class SimulatedTracker:
         self._corners: Ids = np.empty(0, dtype=np.int64)
         # Of each track, on the sensor: error that it had when the reference began, and place now.
         self._offsets = self._places = np.empty((0, 2))
-        self._started, self._shape = 0, (0, 0)
+        self._started = 0
+        self._shape = (0, 0)
 
     @property
     def tracked_fraction(self) -> float:
@@ -199,7 +209,8 @@ class SimulatedTracker:
     def start(self, image: Image) -> None:
         """Make `image` the reference keyframe, with new corners only."""
         self.reset()
-        self._frame, self._shape = number_of(image), (image.shape[0], image.shape[1])
+        self._frame = number_of(image)
+        self._shape = (image.shape[0], image.shape[1])
         self.promote()
 
     def track(
@@ -207,7 +218,8 @@ class SimulatedTracker:
     ) -> Matches:
         """Find the corners in `image`, as `Tracker.track` does."""
         self._frame = number_of(image)
-        frame, known = self._frame, self._sightings
+        frame = self._frame
+        known = self._sightings
         rows = np.searchsorted(known.ids[frame], self._corners)
         rows = np.minimum(rows, len(known.ids[frame]) - 1)
         way = known.travelled[frame] - known.travelled[self._reference]
@@ -230,7 +242,8 @@ class SimulatedTracker:
             reached |= np.linalg.norm(points - self._matches.points2, axis=1) < _REACH
         good = (known.ids[frame][rows] == self._corners) & self._inside(points) & reached
         self._matches = self._matches.followed(points).kept(good)
-        self._corners, self._offsets = self._corners[good], self._offsets[good]
+        self._corners = self._corners[good]
+        self._offsets = self._offsets[good]
         self._places = places[good]
         return self._matches
 
@@ -240,13 +253,16 @@ class SimulatedTracker:
 
     def promote(self) -> None:
         """Make the current image the reference; tracks continue, new corners fill the gaps."""
-        ids, pixels = self._sightings.ids[self._frame], self._sightings.pixels[self._frame]
+        ids = self._sightings.ids[self._frame]
+        pixels = self._sightings.pixels[self._frame]
         kept = keep_apart(self.points, 0.5 * _LEAST_DISTANCE)
-        corners, places = self._corners[kept], self._places[kept]
+        corners = self._corners[kept]
+        places = self._places[kept]
         free = ~np.isin(ids, corners) & self._inside(self._published(pixels))
         # Any of them, but the same ones in every run.
         order = np.argsort(ids[free] * _SCATTER % 2**32)[: max(self._most - len(corners), 0)]
-        new, new_places = ids[free][order], pixels[free][order]
+        new = ids[free][order]
+        new_places = pixels[free][order]
         self._corners = np.concatenate([corners, new])
         self._places = np.concatenate([places, new_places])
         rows = np.searchsorted(ids, self._corners)
@@ -257,7 +273,8 @@ class SimulatedTracker:
             np.stack([points, points]),
             np.ones(len(points)),
         )
-        self._started, self._reference = len(points), self._frame
+        self._started = len(points)
+        self._reference = self._frame
 
     def _inside(self, points: Array) -> NDArray[np.bool_]:
         """Which points (N, 2) of the published image are clear of its border."""
@@ -284,7 +301,9 @@ class Arrival(NamedTuple):
 
 
 # Kinds of recordings: simulated, without images and with them, and others.
-TRACKS, IMAGES, RECORDING = 'tracks', 'images', 'recording'
+TRACKS = 'tracks'
+IMAGES = 'images'
+RECORDING = 'recording'
 
 
 class Source(NamedTuple):
@@ -324,7 +343,8 @@ def simulated(
     source: Source, simulation: Simulation, noise: TrackNoise | None, rng: np.random.Generator
 ) -> Recording:
     """A recording of a simulation: tracks with `noise`, or rendered images where it is None."""
-    config, imu = simulation.config, simulation.imu
+    config = simulation.config
+    imu = simulation.imu
     reference_ns = {
         simulation.stamp_ns(k): simulation.reference_ns(k) for k in range(config.frame_count)
     }
@@ -388,7 +408,8 @@ def run(
     `until` [s]: frames after that are not processed.
     """
     parameters = Parameters.from_mapping(configured.values)
-    camera, known = recording.camera, recording.sightings
+    camera = recording.camera
+    known = recording.sightings
     tracker = (
         None
         if known is None
@@ -499,10 +520,12 @@ def _true_pair(recording: Recording, pair: PairResult) -> trust_rows.TruePair | 
     R, t = truth or (pair.pose.R, pair.pose.t)
     if not np.linalg.norm(t) > 0.0:
         return None
-    camera, inliers = recording.camera, pair.pose.inliers
+    camera = recording.camera
+    inliers = pair.pose.inliers
     middle_ns = to_nanoseconds(float(camera.row_times(0.5 * (camera.height - 1))))
     pixels = [points[inliers] for points in (pair.matches.points1, pair.matches.points2)]
-    rates, middles = [], []
+    rates = []
+    middles = []
     for points, reference_ns in zip(pixels, (pair.reference_ns1, pair.reference_ns2), strict=True):
         row_times = camera.row_times(points[:, 1]) - middle_ns / NANOSECONDS
         # The mean rate between the two rows is about that half way between them.

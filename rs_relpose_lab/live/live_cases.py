@@ -33,7 +33,9 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import stamp_ns
 
 # Of the bag [Hz], of which other cases take each second image; length of a case [s].
-FPS, SECONDS, READOUT = 60, 10.0, 0.02
+FPS = 60
+SECONDS = 10.0
+READOUT = 0.02
 _TOPICS = {
     Image: 'image',
     CompressedImage: 'image/compressed',
@@ -114,7 +116,8 @@ def information(*, focal: float = 1.0, size: int = 1, radial: float = 0.0) -> Ed
     """CameraInfo with another focal length, a size divided by `size`, or first coefficient."""
 
     def change(message: CameraInfo, *_: object) -> None:
-        message.width, message.height = message.width // size, message.height // size
+        message.width = message.width // size
+        message.height = message.height // size
         message.k = (
             np.array(message.k) / [*6 * [size], 1, 1, 1] * [focal, 1, 1, 1, focal, 1, 1, 1, 1]
         )
@@ -265,7 +268,8 @@ def play(
             **case.parameters,
         }.items()
     }
-    named, messages = math.nan, _messages(bag, case)
+    named = math.nan
+    messages = _messages(bag, case)
     with private_domain(), Graph() as graph, node_process(parameters=values) as node:
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
@@ -287,7 +291,8 @@ def play(
         clock = graph.node.create_publisher(Clock, '/clock', 10) if case.clock else None
         node.wait_for('ready: ')
         time.sleep(1.0)
-        started, checked = time.monotonic(), 0.0
+        started = time.monotonic()
+        checked = 0.0
         for due, message in [*messages, (SECONDS + 1.5, None)]:
             time.sleep(max(started + due - time.monotonic(), 0.0))
             if message is not None:
@@ -305,9 +310,11 @@ def play(
 
 def _messages(bag: Path, case: Case) -> list[tuple[float, Any]]:
     """Seconds and messages of a case, in their order."""
-    sent, counts = [], dict.fromkeys(_TOPICS, 0)
+    sent = []
+    counts = dict.fromkeys(_TOPICS, 0)
     with reader.open_bag(bag) as opened:
-        first_ns, image = 0, -1
+        first_ns = 0
+        image = -1
         for raw in opened.raw_messages(opened.topics):
             kind = {
                 sensor_topics.COMPRESSED_IMAGE: CompressedImage,

@@ -33,7 +33,8 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
     Returns the tables of the published poses and of the stamps of the processed frames.
     """
     remap, duration = remap_and_duration(bag)
-    table, stamps = folder / 'live.csv', folder / 'live_stamps.txt'
+    table = folder / 'live.csv'
+    stamps = folder / 'live_stamps.txt'
     with (
         private_domain(),
         Graph() as graph,
@@ -63,7 +64,8 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
 def remap_and_duration(bag: Path) -> tuple[dict[str, str], float]:
     """Names of a node's topics in a bag, and the length of the bag [s]."""
     with open_bag(bag) as opened:
-        topics, duration = opened.find_topics(), opened.duration
+        topics = opened.find_topics()
+        duration = opened.duration
     remap = {'image': topics.image.name.removesuffix('/compressed'), 'imu': topics.imu.name}
     for name, topic in (('camera_info', topics.camera_info), ('accel', topics.accel)):
         if topic is not None:
@@ -128,7 +130,8 @@ class Recorder:
 
 def pose_of(msg: Any) -> tuple[list[float], list[float]]:
     """Position and quaternion x y z w of a pose message."""
-    t, q = msg.pose.pose.position, msg.pose.pose.orientation
+    t = msg.pose.pose.position
+    q = msg.pose.pose.orientation
     return [t.x, t.y, t.z], [q.x, q.y, q.z, q.w]
 
 
@@ -212,7 +215,8 @@ def measure(
 
     `on_second`: called once a second while messages are played.
     """
-    timings, log = folder / 'frames.csv', folder / 'player.npy'
+    timings = folder / 'frames.csv'
+    log = folder / 'player.npy'
     remap = setup.remap
     log.unlink(missing_ok=True)
     with private_domain(), processes.core_for(setup.neighbours) as pin:

@@ -157,9 +157,11 @@ def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[sensor_topics.
 
 
 def _publisher(node: Node, topic: sensor_topics.Topic, options: argparse.Namespace) -> Publisher:
-    name, msgtype = topic.name, topic.msgtype
+    name = topic.name
+    msgtype = topic.msgtype
     if options.decode and msgtype == sensor_topics.COMPRESSED_IMAGE:
-        name, msgtype = name.removesuffix('/compressed'), sensor_topics.IMAGE
+        name = name.removesuffix('/compressed')
+        msgtype = sensor_topics.IMAGE
     reliability = (
         ReliabilityPolicy.BEST_EFFORT if options.best_effort else ReliabilityPolicy.RELIABLE
     )

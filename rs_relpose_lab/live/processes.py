@@ -165,11 +165,13 @@ def wait_until(
 
 def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process) -> None:
     """Wait until `count()` has stayed the same for so many seconds."""
-    known, since = count(), time.monotonic()
+    known = count()
+    since = time.monotonic()
     while time.monotonic() - since < seconds:
         process.ended()
         if count() != known:
-            known, since = count(), time.monotonic()
+            known = count()
+            since = time.monotonic()
         time.sleep(0.05)
 
 

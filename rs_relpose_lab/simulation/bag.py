@@ -97,7 +97,8 @@ def render_once(
 
 def made_once(folder: Path, name: str, make: Callable[[Path, Path], object]) -> tuple[Path, Path]:
     """A bag and its parameter file; `make` writes the file last, unless both exist."""
-    bag, parameters = folder / name, folder / f'{name}.yaml'
+    bag = folder / name
+    parameters = folder / f'{name}.yaml'
     if not (bag.exists() and parameters.exists()):
         # Remains of an interrupted run.
         shutil.rmtree(bag, ignore_errors=True)
@@ -183,7 +184,8 @@ def image_entries(
 
 def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[Entry]:
     """IMU samples with their noise's variances."""
-    config, imu = simulation.config, simulation.imu
+    config = simulation.config
+    imu = simulation.imu
     gyro_covariance, accel_covariance = (
         density**2 * config.imu_rate * np.eye(3)
         for density in (config.gyro_noise_density, config.accel_noise_density)

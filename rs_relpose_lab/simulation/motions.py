@@ -185,7 +185,8 @@ def _walk(rng: np.random.Generator, times: Array, levels: _Levels, speed: float)
             * math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
             + 0.8 * (EYE_HEIGHT - position[2])
         )
-        cosine, sine = math.cos(heading), math.sin(heading)
+        cosine = math.cos(heading)
+        sine = math.sin(heading)
         position = position + CONTROL_SPACING * np.array(
             [along * cosine - across * sine, along * sine + across * cosine, climb]
         )
@@ -227,14 +228,18 @@ def _angles(
 # Height of the camera [m], and distance from the middle of the scene at which the robot returns.
 _ROBOT_HEIGHT = 1.2
 # Yaw rates [rad/s]: of steering about, and largest of the way back to the middle.
-_WANDER_RATE, _HOMING_RATE = math.radians(18.0), math.radians(50.0)
+_WANDER_RATE = math.radians(18.0)
+_HOMING_RATE = math.radians(50.0)
 # Rocking of pitch and roll on the springs: natural frequency [Hz], damping, rms [rad].
-_SPRING_FREQUENCY, _DAMPING, _ROCKING = 1.4, 0.25, math.radians(0.7)
+_SPRING_FREQUENCY = 1.4
+_DAMPING = 0.25
+_ROCKING = math.radians(0.7)
 # Lean [rad] per acceleration [m/s^2]: nose down in braking, outwards in a turn.
 _LEAN = math.radians(1.0)
 _HEAVE = 0.006
 # One stop in so many seconds; how long it takes, with braking and starting.
-_STOP_EVERY, _STOP = 9.0, 2.4
+_STOP_EVERY = 9.0
+_STOP = 2.4
 
 
 def vehicle(rng: np.random.Generator, start: float, end: float, *, speed: float) -> Trajectory:
@@ -281,8 +286,10 @@ def _drive(
         + np.sin(2 * math.pi * 0.29 * times + phases[1])
     )
     position = np.array([*rng.uniform(-1.0, 1.0, 2), _ROBOT_HEIGHT])
-    heading, steering = rng.uniform(-math.pi, math.pi), 0.0
-    positions, yaw = np.empty((len(times), 3)), np.empty(len(times))
+    heading = rng.uniform(-math.pi, math.pi)
+    steering = 0.0
+    positions = np.empty((len(times), 3))
+    yaw = np.empty(len(times))
     for k, driven in enumerate(speeds):
         positions[k], yaw[k] = position, heading
         wanted = wander[k]
@@ -304,7 +311,8 @@ def _drive(
 def _spring(push: Array) -> Array:
     """Answer (K,) of a damped spring to the road's pushes (K,), of about unit variance."""
     w = 2 * math.pi * _SPRING_FREQUENCY
-    place, rate = 0.0, 0.0
+    place = 0.0
+    rate = 0.0
     places = np.empty(len(push))
     # Variance of the place under white noise of density q: q / (4 damping w^3).
     strength = math.sqrt(4.0 * _DAMPING * w**3 / CONTROL_SPACING)

@@ -181,18 +181,16 @@ class _Exposure(NamedTuple):
 # Columns of a face, a surface from one row's position: unit normal, height of the camera
 # above its plane; axes of its texture and the camera's own place along them; size; the surface's
 # index; direction and half angle of a cone around it.
-_NORMAL, _HEIGHT, _ACROSS, _A, _DOWN, _B, _SIZE, _INDEX, _TOWARDS, _ANGLE = (
-    0,
-    3,
-    4,
-    7,
-    8,
-    11,
-    12,
-    14,
-    15,
-    18,
-)
+_NORMAL = 0
+_HEIGHT = 3
+_ACROSS = 4
+_A = 7
+_DOWN = 8
+_B = 11
+_SIZE = 12
+_INDEX = 14
+_TOWARDS = 15
+_ANGLE = 18
 _FACE_COLUMNS = 19
 
 
@@ -214,7 +212,10 @@ def _rotated(rotation, x, y, z):  # type: ignore[no-untyped-def]
 @_jit
 def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
     """Surfaces that face `position`; fills `faces` and returns their number."""
-    corners, across, down, sizes = scene.corners, scene.across, scene.down, scene.sizes
+    corners = scene.corners
+    across = scene.across
+    down = scene.down
+    sizes = scene.sizes
     count = 0
     for s in range(len(corners)):
         i = count
@@ -322,7 +323,9 @@ def _bilinear(pixels, offset, height, width, x, y):  # type: ignore[no-untyped-d
 @_inline
 def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, scene):  # type: ignore[no-untyped-def]
     """Gray value of a pixel's footprint: trilinear lookups along its longer axis."""
-    offsets, shapes, levels = scene.offsets, scene.shapes, scene.levels
+    offsets = scene.offsets
+    shapes = scene.shapes
+    levels = scene.levels
     s = int(faces[i, _INDEX])
     minor = distance * pixel_angle
     major = minor / max(-_dot(x, y, z, faces, i, _NORMAL), 1e-3)

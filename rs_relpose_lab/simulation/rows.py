@@ -75,8 +75,11 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
     before = np.full(len(world), 0.5 * (view.rows - 1))
     projected = project(left, before)[:, view.axis]
     ahead = np.isfinite(projected)
-    left, before, projected = left[ahead], before[ahead], projected[ahead]
-    rows, slope = projected, np.zeros(len(left))
+    left = left[ahead]
+    before = before[ahead]
+    projected = projected[ahead]
+    rows = projected
+    slope = np.zeros(len(left))
     for _ in range(_MAX_ROUNDS):
         if not len(left):
             break
@@ -95,7 +98,10 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
             appears > rows
         )
         again = ~settled & ~beyond & np.isfinite(appears)
-        left, before, projected, slope = left[again], rows[again], appears[again], slope[again]
+        left = left[again]
+        before = rows[again]
+        projected = appears[again]
+        slope = slope[again]
         rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
     inside = (
         (observed >= -margin) & (observed <= np.array([view.width - 1, view.height - 1]) + margin)

@@ -48,7 +48,8 @@ def _noise(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float
     """Noise (H, W) of about unit variance, long waves stronger than short ones."""
     total = np.zeros(shape, dtype=np.float32)
     wavelength = _SHORTEST_WAVELENGTH
-    strength, power = 1.0, 0.0
+    strength = 1.0
+    power = 0.0
     while power == 0.0 or wavelength < 0.7 * min(shape):
         spacing = wavelength / 2
         rows, columns = (math.ceil(size / spacing) + 4 for size in shape)
@@ -104,7 +105,8 @@ def _draw_shapes(rng: np.random.Generator, canvas: NDArray[np.uint8], *, density
     angles = rng.uniform(0.0, 2 * math.pi, count)
     kinds = rng.integers(0, 4, count).tolist()
     skews = rng.uniform(-0.2, 0.2, (count, 4))
-    cosines, sines = np.cos(angles), np.sin(angles)
+    cosines = np.cos(angles)
+    sines = np.sin(angles)
     # Outlines of all polygons at once; a triangle uses three of the corners.
     corners = np.where(np.array(kinds) == 1, 3, 4)
     around = 2 * math.pi * (np.arange(4) + skews) / corners[:, None]
@@ -235,7 +237,8 @@ def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scen
 
 
 def _hall(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | None]:
-    length, side = rng.uniform(9.0, 11.0), rng.uniform(7.5, 9.0)
+    length = rng.uniform(9.0, 11.0)
+    side = rng.uniform(7.5, 9.0)
     yield from builder.room(-7.0, length, -side, side, rng.uniform(3.6, 4.4))
     yield from _crates(builder, rng, count=14, reach=length - 2.0)
     for _ in range(4):
@@ -252,7 +255,8 @@ def _yard(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | Non
     border = -15.0
     while border < 15.0:
         width = rng.uniform(3.5, 6.0)
-        x, height = rng.uniform(7.5, 13.0), rng.uniform(4.0, 8.0)
+        x = rng.uniform(7.5, 13.0)
+        height = rng.uniform(4.0, 8.0)
         yield from builder.box(
             (x + 1.5, border + width / 2, height / 2), (3.0, width, height), 0.0
         )
@@ -268,7 +272,8 @@ def _yard(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | Non
 
 
 def _gallery(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | None]:
-    length, side = rng.uniform(12.0, 14.5), rng.uniform(5.0, 5.8)
+    length = rng.uniform(12.0, 14.5)
+    side = rng.uniform(5.0, 5.8)
     yield from builder.room(-6.0, length, -side, side, rng.uniform(3.4, 4.2))
     for sign in (-1.0, 1.0):
         for x in np.arange(2.0, length - 1.0, 2.2):
@@ -356,7 +361,8 @@ class _Builder:
             ((-1, 0, 0), (0, -1, 0)),
             ((0, -1, 0), (1, 0, 0)),
         ):
-            ahead, left = np.array(along, dtype=float), np.array(to_left, dtype=float)
+            ahead = np.array(along, dtype=float)
+            left = np.array(to_left, dtype=float)
             yield self.surface(
                 d * ahead + d * left + (0, 0, 20.0), -left, (0, 0, -1), 2 * d, 30.0, 0.3
             )
@@ -366,7 +372,8 @@ class _Builder:
         self, centre: tuple[float, float, float], size: tuple[float, ...], yaw: float
     ) -> Iterator[Surface | None]:
         """Four sides and the top; `size` along x, y, z before rotation by `yaw` [rad]."""
-        cosine, sine = math.cos(yaw), math.sin(yaw)
+        cosine = math.cos(yaw)
+        sine = math.sin(yaw)
         forward = np.array([cosine, sine, 0.0])
         left = np.array([-sine, cosine, 0.0])
         up = np.array([0.0, 0.0, 1.0])

@@ -35,7 +35,8 @@ class ImuModel:
 
         Specific force is ``R^T (a - g)``: +g upwards at rest.
         """
-        w, dw = states.angular_velocity, states.angular_acceleration
+        w = states.angular_velocity
+        dw = states.angular_acceleration
         lever = np.broadcast_to(np.asarray(self.lever_arm, dtype=np.float64), w.shape)
         # a_imu = a + R (dw x l + w x (w x l)), the rigid body's other point.
         rotation = np.cross(dw, lever) + np.cross(w, np.cross(w, lever))
@@ -146,7 +147,8 @@ def simulate(
     if trajectory is None:
         rng = _stream(config.seed, _MOTION)
         plan = Plan.parse(config.plan) if config.plan else Plan.drawn(rng, config.duration)
-        speed, rotation_rate = rng.uniform(1.5, 1.8), math.radians(rng.uniform(25.0, 45.0))
+        speed = rng.uniform(1.5, 1.8)
+        rotation_rate = math.radians(rng.uniform(25.0, 45.0))
         # Wider than any camera needs: the motion must not depend on readout or stamped row.
         trajectory = hand_held(
             rng,

@@ -119,7 +119,10 @@ def _body_rates(angles: Array, first: Array, second: Array) -> tuple[Array, Arra
     _, pitch, roll = angles.T
     dy, dp, dr = first.T
     ddy, ddp, ddr = second.T
-    sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
+    sp = np.sin(pitch)
+    cp = np.cos(pitch)
+    sr = np.sin(roll)
+    cr = np.cos(roll)
     rate = np.stack([dr - dy * sp, dp * cr + dy * sr * cp, -dp * sr + dy * cr * cp], axis=1)
     change = np.stack(
         [

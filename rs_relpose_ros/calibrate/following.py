@@ -219,5 +219,6 @@ def _located(
     at_border = np.cumsum(difference) - difference
     likely = np.flatnonzero(at_border <= at_border.min() + _NOT_KNOWN)
     # A pair that contains the step fits at neither offset.
-    first, last = max(int(likely[0]) - 2, 0), min(int(likely[-1]) + 2, len(pairs) - 1)
+    first = max(int(likely[0]) - 2, 0)
+    last = min(int(likely[-1]) + 2, len(pairs) - 1)
     return replace(step, begin=float(begins[first]), end=float(ends[last]))

@@ -147,7 +147,8 @@ def fitted(
     progress: Callable[[float], object] = lambda share: None,
 ) -> Fitted:
     """The fit of `calibrate`, before it is evaluated."""
-    tracks, gyro = recording.tracks, recording.gyro
+    tracks = recording.tracks
+    gyro = recording.gyro
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(
             f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
@@ -219,7 +220,9 @@ def _calibrated(
 
 def warm_up_fit() -> None:
     """Compile (or load from the cache) the kernels of a calibration, on made-up points."""
-    frames, points, rng = 60, 30, np.random.default_rng(0)
+    frames = 60
+    points = 30
+    rng = np.random.default_rng(0)
     stamps_ns = np.arange(frames) * to_nanoseconds(1.0 / 30.0)
     tracks = TrackedPoints(
         stamps_ns,
@@ -251,7 +254,8 @@ def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None) -> tup
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
-    R, part = final.unknowns.R_cam_imu, model.ROTATION
+    R = final.unknowns.R_cam_imu
+    part = model.ROTATION
     covariance = final.covariance.copy()
     _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS], R)
     if one_axis:  # about which the fit means nothing
@@ -373,7 +377,9 @@ def _fit_with_lens(
     rng: np.random.Generator,
 ) -> tuple[Observations, fit.Fit]:
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
-    seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
+    seed = int(rng.integers(2**32))
+    offset = coarse.parameters[model.OFFSET]
+    found = None
     for _ in range(_LENS_ROUNDS):
         moved = about(data.lens + coarse.parameters[model.LENS])
         data = moved.like(data)
@@ -426,7 +432,8 @@ def calibrate_together(
                 'the recordings have different CameraInfo or image sizes: calibrate bags of one '
                 'camera at one resolution together, others each alone'
             )
-    R_prior, count = rotation_of(quat_prior), len(recordings)
+    R_prior = rotation_of(quat_prior)
+    count = len(recordings)
     found: list[Fitted] = []
     for recording in recordings:
 
@@ -517,11 +524,11 @@ def evaluated(
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
     unknowns, covariance = _with_common_errors(final, config)
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
-    parameters, R_cam_imu = bounded.parameters, bounded.R_cam_imu
+    parameters = bounded.parameters
+    R_cam_imu = bounded.R_cam_imu
     rates, one_axis, _ = data.excitation(parameters[model.BIAS], R_cam_imu)
-    sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
-    if errors.move_of_poses(final, covariance) <= 1.0:
-        wide = max(wide, config.unnoticed_tolerance)
+    sigmas = np.sqrt(np.diag(covariance))
+    wide = _tolerance(final, covariance, config)
     axis_map = observations.nearest_axis_map(R_cam_imu)
 
     def of(k: int) -> Estimate:
@@ -566,6 +573,13 @@ def evaluated(
         frame_interval=data.interval,
         warnings=tuple(filter(None, (*notes, one_axis, beyond))),
     )
+
+
+def _tolerance(final: fit.Fit, covariance: Array, config: CalibrationConfig) -> float:
+    """Factor of the largest sigmas of observable values: wider if poses hardly notice them."""
+    if errors.move_of_poses(final, covariance) <= 1.0:
+        return max(config.tolerance, config.unnoticed_tolerance)
+    return config.tolerance
 
 
 def _notes(
@@ -823,7 +837,8 @@ def _bounded(
     follow by their covariance with it; an estimate less certain than the bound itself is joined
     with that. See docs/calibration.md, "Interpretation of the results".
     """
-    k, known = model.READOUT, interval / math.sqrt(12.0)
+    k = model.READOUT
+    known = interval / math.sqrt(12.0)
     if covariance[k, k] > known**2:
         return (
             *joined(
@@ -838,7 +853,8 @@ def _bounded(
                 f'that is read downwards within the {1e3 * interval:.1f} ms between frames'
             ),
         )
-    readout, sigma = float(unknowns.parameters[k]), math.sqrt(covariance[k, k])
+    readout = float(unknowns.parameters[k])
+    sigma = math.sqrt(covariance[k, k])
     found = 'the readout time is estimated as ' + with_sigma(
         Code.READOUT_TIME, abs(readout), sigma
     )
@@ -850,7 +866,8 @@ def _bounded(
         )
     # Of a truncated normal distribution; at least 0.1 % of it lies within.
     ends = (np.array([-interval, interval]) - readout) / sigma
-    density, below = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi), special.ndtr(ends)
+    density = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi)
+    below = special.ndtr(ends)
     mean = readout - sigma * float(np.diff(density)[0] / np.diff(below)[0])
     step = covariance[:, k] * ((mean - readout) / sigma**2)
     note = (
@@ -960,7 +977,8 @@ def read_recording(
     Of `images`, by their number in the bag, and of the gyro meanwhile; None: all. InputError or
     MissingInputError if the bag is damaged, or has no usable image or no gyro.
     """
-    recorder, number = Recorder(tracking), 0
+    recorder = Recorder(tracking)
+    number = 0
     if topics.camera_info is None:
         recorder.uncalibrated = True
     for role, message in sensor_messages(bag, topics, (Role.IMU, Role.CAMERA_INFO, Role.IMAGE)):
@@ -980,7 +998,8 @@ class Recorder:
         self.uncalibrated = False  # whether there is no calibrated CameraInfo
         self.unused = ReasonCounts()  # messages
         self._longest = longest
-        self._tracker, self._levels = make_tracker(tracking), GrayLevels()
+        self._tracker = make_tracker(tracking)
+        self._levels = GrayLevels()
         self._since_renewed = 0  # images
         # Stamps of the images, ids and pixels (N, 2) of their points.
         self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
@@ -1042,14 +1061,16 @@ class Recorder:
         since_ns = stamp_ns - self._changed_ns
         if rates == self._last_rates:
             return 0 <= since_ns < _LONGEST_HELD_NS
-        self._last_rates, self._changed_ns = rates, stamp_ns
+        self._last_rates = rates
+        self._changed_ns = stamp_ns
         return False
 
     def follow(self, encoded: EncodedImage) -> None:
         """Track the points of the images before in another one; InputError if it is unusable."""
         if self._frames and encoded.stamp_ns <= self.last_ns:
             raise InputError('the stamp of an image is not later than the previous one')
-        image, tracker = encoded.decoded(self._levels), self._tracker
+        image = encoded.decoded(self._levels)
+        tracker = self._tracker
         if not self._frames:
             tracker.start(image)
         # Matches with the reference, so that errors do not add up from frame to frame.
@@ -1099,7 +1120,8 @@ class Recorder:
         if intrinsics is None and not self.uncalibrated:
             raise MissingInputError(f'no CameraInfo can be used{why}')
         of_frames, ids, pixels = zip(*self._frames, strict=True)
-        points, stamps = np.concatenate(pixels, dtype=np.float64), sorted(self._gyro)
+        points = np.concatenate(pixels, dtype=np.float64)
+        stamps = sorted(self._gyro)
         if intrinsics is not None:
             points = intrinsics.to_sensor(points)
         frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))

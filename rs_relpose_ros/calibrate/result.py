@@ -142,7 +142,8 @@ class CalibrationResult:
         Rolling: the readout time as fitted is 5 sigma and 1 ms from zero; global: it is within
         3 sigma or 1 ms of zero, and known to a millisecond.
         """
-        value, sigma = abs(self.fitted_readout), self.readout_time.sigma
+        value = abs(self.fitted_readout)
+        sigma = self.readout_time.sigma
         if value > max(5.0 * sigma, 1e-3):
             return 'rolling'
         return 'global' if sigma < 1e-3 and value < max(3.0 * sigma, 1e-3) else 'unsure'
@@ -182,7 +183,8 @@ def quantities(result: CalibrationResult, camera: RollingShutterCamera) -> list[
 def _clock_quantities(result: CalibrationResult) -> list[_Quantity]:
     """Readout time and time offset, and what the offset varies with."""
     readout = result.readout_time
-    slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    slope = result.offset_by_interval
+    jitter = result.offset_by_jitter
     direction = _DIRECTIONS[result.readout_direction]
     text = _shown('readout_time', readout, abs(readout.value)) + direction
     offset = result.time_offset
@@ -267,7 +269,8 @@ def _motion_quantities(result: CalibrationResult) -> list[_Quantity]:
 
 def _exposure_quantities(result: CalibrationResult) -> list[_Quantity]:
     """The exposure, where it was estimated."""
-    exposure, margin = result.exposure, _MS * result.exposure_margin
+    exposure = result.exposure
+    margin = _MS * result.exposure_margin
     if not exposure.sigma:
         return []
     text = (
@@ -340,7 +343,8 @@ def _shown(name: str, estimate: Estimate, value: float | None = None) -> str:
 
 
 def _shutter_text(result: CalibrationResult) -> str:
-    readout, shown = result.readout_time, _shown('readout_time', result.readout_time)
+    readout = result.readout_time
+    shown = _shown('readout_time', result.readout_time)
     if result.shutter == 'global':
         return f'global: the readout time is {shown}'
     if result.shutter == 'unsure':
@@ -440,7 +444,8 @@ def _parameters(result: CalibrationResult) -> Iterator[_Group]:
 
 
 def _readout_parameters(result: CalibrationResult) -> _Group:
-    readout, shutter = result.readout_time, _shutter_text(result)
+    readout = result.readout_time
+    shutter = _shutter_text(result)
     rolling = result.shutter != 'global'
     source = (
         f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
@@ -457,7 +462,9 @@ def _readout_parameters(result: CalibrationResult) -> _Group:
 
 def _clock_parameters(result: CalibrationResult) -> list[_Parameter]:
     """Offset of the clocks, what it varies with, and the exposure."""
-    offset, slope, exposure = result.time_offset, result.offset_by_interval, result.exposure
+    offset = result.time_offset
+    slope = result.offset_by_interval
+    exposure = result.exposure
     values: list[_Parameter] = [
         ('stamp_row', 'first', 'Convention of time_offset here.'),
         ('time_offset', round(offset.value, 6), 'To the middle of the exposure of row 0.'),
@@ -487,7 +494,9 @@ def _clock_parameters(result: CalibrationResult) -> list[_Parameter]:
 
 
 def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[_Parameter]:
-    focal, column, row = lens.focal_factor, lens.column, lens.row
+    focal = lens.focal_factor
+    column = lens.column
+    row = lens.row
     return [
         (
             'camera_matrix',
@@ -518,7 +527,8 @@ def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[
 
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
     """The result for a JSON file; seconds, radians, pixels."""
-    slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    slope = result.offset_by_interval
+    jitter = result.offset_by_jitter
     lens: dict[str, Any] = dict.fromkeys(
         ('focal_px', 'distortion_first', 'distortion', 'displacement', 'principal_point_px')
     )
@@ -587,7 +597,8 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
 
     picture = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
     axes = picture.subplots()
-    readout, (tried, costs) = result.readout_time, result.curve
+    readout = result.readout_time
+    (tried, costs) = result.curve
     # The root of a parabola is straight on both sides of the best.
     axes.plot(_MS * tried, np.sqrt(2.0 * costs), 'o-', color=BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)

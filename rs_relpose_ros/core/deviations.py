@@ -137,7 +137,8 @@ class Selection:
     def of_camera(self, camera: RollingShutterCamera) -> Array:
         """Basis (N_DEVIATIONS, k) of values in units of a camera: see `ENTRIES`."""
         basis = self.basis.copy()
-        center, distortion = PARTS['principal_point'], PARTS['distortion']
+        center = PARTS['principal_point']
+        distortion = PARTS['distortion']
         basis[center] *= camera.width
         basis[distortion] = independent_shapes(corner_radius(camera)) @ basis[distortion]
         return basis

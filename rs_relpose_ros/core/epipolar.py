@@ -57,14 +57,21 @@ class Residual(NamedTuple):
 def residual(first: View, second: View, baseline: Vector) -> Residual:
     """Evaluate the residual of a match."""
     # Derivatives of e by the two rays.
-    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)
+    by_ray_1 = cross(second.ray, baseline)
+    by_ray_2 = cross(baseline, first.ray)
     e = dot(by_ray_1, first.ray)
-    q1, q2 = dot(by_ray_1, first.by_u), dot(by_ray_1, first.by_v)
-    q3, q4 = dot(by_ray_2, second.by_u), dot(by_ray_2, second.by_v)
-    inverse = 1.0 / math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4 + LEAST_SQUARE)
+    q1 = dot(by_ray_1, first.by_u)
+    q2 = dot(by_ray_1, first.by_v)
+    q3 = dot(by_ray_2, second.by_u)
+    q4 = dot(by_ray_2, second.by_v)
+    gradient_square = q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4 + LEAST_SQUARE
+    inverse = 1.0 / math.sqrt(gradient_square)
     value = e * inverse
     c = -value * inverse * inverse
-    c1, c2, c3, c4 = c * q1, c * q2, c * q3, c * q4
+    c1 = c * q1
+    c2 = c * q2
+    c3 = c * q3
+    c4 = c * q4
     by_pixel_1 = add(scale(c1, first.by_u), scale(c2, first.by_v))
     by_pixel_2 = add(scale(c3, second.by_u), scale(c4, second.by_v))
     scaled_1 = add(scale(inverse, first.ray), by_pixel_1)
@@ -85,7 +92,8 @@ def by_motion(
         cross(at.scaled_2, cross(baseline, first.ray)),
     )
     # Rotating both images and the baseline together changes nothing.
-    by_rotation_1 = scale(-1.0, add(by_rotation_2, cross(baseline, by_baseline)))
+    by_both = add(by_rotation_2, cross(baseline, by_baseline))
+    by_rotation_1 = scale(-1.0, by_both)
     return by_baseline, by_rotation_1, by_rotation_2
 
 
@@ -96,16 +104,21 @@ def by_rays(first: View, second: View, baseline: Vector, at: Residual) -> tuple[
     A change of the lens, for example, changes all six vectors.
     """
     # Derivatives of e by the two rays.
-    by_ray_1, by_ray_2 = cross(second.ray, baseline), cross(baseline, first.ray)
+    by_ray_1 = cross(second.ray, baseline)
+    by_ray_2 = cross(baseline, first.ray)
     c1, c2, c3, c4 = at.factors
-    return (
-        View(
-            add(scale(at.inverse_gradient, by_ray_1), cross(at.scaled_2, baseline)),
-            scale(c1, by_ray_1),
-            scale(c2, by_ray_1),
-        ),
-        View(cross(baseline, at.scaled_1), scale(c3, by_ray_2), scale(c4, by_ray_2)),
+    through_e = scale(at.inverse_gradient, by_ray_1)
+    by_view_1 = View(
+        add(through_e, cross(at.scaled_2, baseline)),
+        scale(c1, by_ray_1),
+        scale(c2, by_ray_1),
     )
+    by_view_2 = View(
+        cross(baseline, at.scaled_1),
+        scale(c3, by_ray_2),
+        scale(c4, by_ray_2),
+    )
+    return by_view_1, by_view_2
 
 
 @inlined_kernel
@@ -153,9 +166,15 @@ def derivatives(views: Array, baselines: Array) -> Derivatives:
     row of image 2.
     """
     n = len(views)
-    out = Derivatives(np.empty(n), np.empty((n, 3)), np.empty((n, 2, 3)), np.empty((n, 2, 3, 3)))
+    out = Derivatives(
+        residuals=np.empty(n),
+        by_baseline=np.empty((n, 3)),
+        by_rotation=np.empty((n, 2, 3)),
+        by_rays=np.empty((n, 2, 3, 3)),
+    )
     for i in range(n):
-        first, second = _view(views[i, 0]), _view(views[i, 1])
+        first = _view(views[i, 0])
+        second = _view(views[i, 1])
         baseline = (baselines[i, 0], baselines[i, 1], baselines[i, 2])
         at = residual(first, second, baseline)
         by_baseline, by_rotation_1, by_rotation_2 = by_motion(first, second, baseline, at)

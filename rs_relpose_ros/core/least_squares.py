@@ -91,7 +91,8 @@ def damped_step(hessian: Array, gradient: Array, damping: float) -> tuple[Array,
     damped matrix is not positive definite.
     """
     n = len(gradient)
-    damped, factor = hessian.copy(), np.zeros((n, n))
+    damped = hessian.copy()
+    factor = np.zeros((n, n))
     for i in range(n):
         damped[i, i] += damping * hessian[i, i] + LEAST_INFORMATION
     if not cholesky(damped, factor):
@@ -115,7 +116,8 @@ def _scaled_factor(information: Array) -> tuple[Array, Array]:
     scale = np.empty(n)
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
-    scaled, factor = np.empty((n, n)), np.zeros((n, n))
+    scaled = np.empty((n, n))
+    factor = np.zeros((n, n))
     for i in range(n):
         for j in range(n):
             scaled[i, j] = information[i, j] * scale[j] * scale[i]
@@ -166,7 +168,8 @@ def eliminate(hessian: Array, gradient: Array, kept: int) -> tuple[Array, Array]
     mixed = hessian[:kept, kept:].copy()
     gain = mixed @ inverse(hessian[kept:, kept:].copy())
     reduced = hessian[:kept, :kept] - gain @ mixed.T
-    return 0.5 * (reduced + reduced.T), gradient[:kept] - gain @ gradient[kept:]
+    symmetric = 0.5 * (reduced + reduced.T)
+    return symmetric, gradient[:kept] - gain @ gradient[kept:]
 
 
 # -- Groups of residuals with unknowns of their own -----------------------------------------------
@@ -182,14 +185,16 @@ def factor_groups(own: Array, factors: Array) -> None:
 
     Only lower triangles are read and written. The diagonals receive the inverses of those of L.
     """
-    m, groups = own.shape[0], own.shape[2]
+    m = own.shape[0]
+    groups = own.shape[2]
     for i in range(m):
         for j in range(i + 1):
             value = factors[i, j]
             for g in range(groups):
                 value[g] = own[i, j, g]
             for k in range(j):
-                left, right = factors[i, k], factors[j, k]
+                left = factors[i, k]
+                right = factors[j, k]
                 for g in range(groups):
                     value[g] -= left[g] * right[g]
             if i == j:
@@ -210,7 +215,8 @@ def solve_lower_groups(factors: Array, right: Array, out: Array) -> None:
         for g in range(groups):
             value[g] = right[i, g]
         for k in range(i):
-            left, known = factors[i, k], out[k]
+            left = factors[i, k]
+            known = out[k]
             for g in range(groups):
                 value[g] -= left[g] * known[g]
         inverse_diagonal = factors[i, i]
@@ -225,7 +231,8 @@ def solve_upper_groups(factors: Array, values: Array) -> None:
     for i in range(m - 1, -1, -1):
         value = values[i]
         for k in range(i + 1, m):
-            left, known = factors[k, i], values[k]
+            left = factors[k, i]
+            known = values[k]
             for g in range(groups):
                 value[g] -= left[g] * known[g]
         inverse_diagonal = factors[i, i]
@@ -258,7 +265,9 @@ def adjusted_scores(scores: Array, curvatures: Array, hessian: Array, deleted: f
     unknowns are not determined keeps s_g.
     """
     n = hessian.shape[0]
-    adjusted, rest, factor = scores.copy(), np.empty((n, n)), np.zeros((n, n))
+    adjusted = scores.copy()
+    rest = np.empty((n, n))
+    factor = np.zeros((n, n))
     for g in range(len(scores)):
         for i in range(n):
             for j in range(n):
@@ -267,5 +276,6 @@ def adjusted_scores(scores: Array, curvatures: Array, hessian: Array, deleted: f
             # (I - H_g H^-1)^-1 s = H (H - H_g)^-1 s
             without = hessian @ newton_step(factor, scores[g])
             for i in range(n):
-                adjusted[g, i] = (1.0 - deleted) * scores[g, i] - deleted * without[i]
+                own = (1.0 - deleted) * scores[g, i]
+                adjusted[g, i] = own - deleted * without[i]
     return adjusted

@@ -61,7 +61,8 @@ def robust_scale(residuals: Array, floor: float, freedom: float) -> float:
     """
     count = len(residuals)
     scale = SIGMA_PER_MEDIAN * so3.median(np.abs(residuals))
-    return max(scale * math.sqrt(count / max(count - freedom, 1.0)), floor)
+    left = max(count - freedom, 1.0)
+    return max(scale * math.sqrt(count / left), floor)
 
 
 # -- Mixture of two variances ---------------------------------------------------------------------
@@ -101,7 +102,8 @@ def noise_mixture(residuals: Array, use: Flags, configured: float) -> tuple[Arra
     its inverse variance over the two cases. The `configured` noise [px] counts as ten matches.
     """
     weights = np.zeros(len(residuals))
-    count, squares = 0, 0.0
+    count = 0
+    squares = 0.0
     for i in range(len(residuals)):
         if use[i]:
             count += 1
@@ -112,7 +114,8 @@ def noise_mixture(residuals: Array, use: Flags, configured: float) -> tuple[Arra
     share = FIRST_SHARE
     less_weight = 1.0 - 1.0 / (WORSE * WORSE)
     for _ in range(EM_ROUNDS):
-        squares, worse = 0.0, 0.0
+        squares = 0.0
+        worse = 0.0
         for i in range(len(residuals)):
             if not use[i]:
                 continue
@@ -120,7 +123,8 @@ def noise_mixture(residuals: Array, use: Flags, configured: float) -> tuple[Arra
             q = square / variance
             if not q < LARGEST:  # NaN counts as large
                 q = LARGEST
-            ratio = share / (1.0 - share) / WORSE * math.exp(0.5 * q * less_weight)
+            likelihood_ratio = math.exp(0.5 * q * less_weight)
+            ratio = share / (1.0 - share) / WORSE * likelihood_ratio
             probability = ratio / (1.0 + ratio)
             worse += probability
             weights[i] = 1.0 - probability * less_weight

@@ -253,8 +253,10 @@ def distort(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) 
     along_y = r2 + 2.0 * y * y
     moved_x = x * radial + 2.0 * p1 * x * y + p2 * along_x
     moved_y = y * radial + p1 * along_y + 2.0 * p2 * x * y
-    out[0] = moved_x + r2 * (s1 + r2 * s2)
-    out[1] = moved_y + r2 * (s3 + r2 * s4)
+    lifted_x = s1 + r2 * s2
+    lifted_y = s3 + r2 * s4
+    out[0] = moved_x + r2 * lifted_x
+    out[1] = moved_y + r2 * lifted_y
     prism_x = s1 + 2.0 * r2 * s2
     prism_y = s3 + 2.0 * r2 * s4
     mixed = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
@@ -461,10 +463,12 @@ def _bends(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -
         square = 2.0 * lens.sideways[2 + 2 * c]
         fourth = 4.0 * lens.sideways[3 + 2 * c]
         mixed = by_xy[c] + 2.0 * fourth * x * y
-        out[c, 0, 0] = by_xx[c] + (square + fourth * (r2 + 2.0 * x * x))
+        prism_x = square + fourth * (r2 + 2.0 * x * x)
+        prism_y = square + fourth * (r2 + 2.0 * y * y)
+        out[c, 0, 0] = by_xx[c] + prism_x
         out[c, 0, 1] = mixed
         out[c, 1, 0] = mixed
-        out[c, 1, 1] = by_yy[c] + (square + fourth * (r2 + 2.0 * y * y))
+        out[c, 1, 1] = by_yy[c] + prism_y
 
 
 @kernel
@@ -478,8 +482,10 @@ def _write_both(
         for c in range(2):
             out_cu = out[c, u]
             # dJ/dq through the point that moves.
-            by_x = A[c, 0] * _dot(bends[0, 0], P) + A[c, 1] * _dot(bends[1, 0], P)
-            by_y = A[c, 0] * _dot(bends[0, 1], P) + A[c, 1] * _dot(bends[1, 1], P)
+            A_c0 = A[c, 0]
+            A_c1 = A[c, 1]
+            by_x = A_c0 * _dot(bends[0, 0], P) + A_c1 * _dot(bends[1, 0], P)
+            by_y = A_c0 * _dot(bends[0, 1], P) + A_c1 * _dot(bends[1, 1], P)
             for q in range(N_LENS):
                 out_cu[q] = -(by_x * by_lens[0, q] + by_y * by_lens[1, q])
             # dJ/dq through the coefficient: G I + 2 G' n n^T.

@@ -29,31 +29,51 @@ def dot(a: Vector | Array, b: Vector | Array) -> float:
 @small_kernel
 def cross(a: Vector | Array, b: Vector | Array) -> Vector:
     """``a x b``."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 @small_kernel
 def add(a: Vector | Array, b: Vector | Array) -> Vector:
     """``a + b``."""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    return (
+        a[0] + b[0],
+        a[1] + b[1],
+        a[2] + b[2],
+    )
 
 
 @small_kernel
 def subtract(a: Vector | Array, b: Vector | Array) -> Vector:
     """``a - b``."""
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+    return (
+        a[0] - b[0],
+        a[1] - b[1],
+        a[2] - b[2],
+    )
 
 
 @small_kernel
 def scale(factor: float, v: Vector | Array) -> Vector:
     """``factor v``."""
-    return (factor * v[0], factor * v[1], factor * v[2])
+    return (
+        factor * v[0],
+        factor * v[1],
+        factor * v[2],
+    )
 
 
 @small_kernel
 def column(rows: Array, first: int, i: int) -> Vector:
     """Vector in column i of `rows` (n, m), from row `first` on."""
-    return (rows[first, i], rows[first + 1, i], rows[first + 2, i])
+    return (
+        rows[first, i],
+        rows[first + 1, i],
+        rows[first + 2, i],
+    )
 
 
 @small_kernel
@@ -91,13 +111,21 @@ def copy_matrix(source: Array, out: Array) -> None:
 @small_kernel
 def rotated(R: Array, v: Vector | Array) -> Vector:
     """``R v`` with any matrix R (3, 3)."""
-    return (dot(R[0], v), dot(R[1], v), dot(R[2], v))
+    return (
+        dot(R[0], v),
+        dot(R[1], v),
+        dot(R[2], v),
+    )
 
 
 @small_kernel
 def rotated_back(R: Array, v: Vector | Array) -> Vector:
     """``R^T v`` with any matrix R (3, 3)."""
-    return (dot(R[:, 0], v), dot(R[:, 1], v), dot(R[:, 2], v))
+    return (
+        dot(R[:, 0], v),
+        dot(R[:, 1], v),
+        dot(R[:, 2], v),
+    )
 
 
 @kernel
@@ -237,12 +265,23 @@ def product_transposed(A: Array, B: Array) -> Array:
 @register_jitable
 def skew(v: Vector | Array) -> Array:
     """Cross-product matrix (3, 3) of a vector (3,): ``skew(a) @ b = a x b``."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    x = v[0]
+    y = v[1]
+    z = v[2]
+    return np.array(
+        [
+            [0.0, -z, y],
+            [z, 0.0, -x],
+            [-y, x, 0.0],
+        ]
+    )
 
 
 def heading(R: Array) -> Array:
     """Rotation vector (3,) about z [rad] that is closest to a rotation matrix (3, 3)."""
-    return np.array([0.0, 0.0, math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])])
+    sine = R[1, 0] - R[0, 1]
+    cosine = R[0, 0] + R[1, 1]
+    return np.array([0.0, 0.0, math.atan2(sine, cosine)])
 
 
 def by_axes(matrix: Array) -> Array:
@@ -260,7 +299,8 @@ def aligning_rotation(correlation: Array) -> Array:
     SciPy's ``align_vectors`` warns if the rotation about one axis is arbitrary.
     """
     u, _, vt = np.linalg.svd(correlation)
-    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)  # no reflection
+    handedness = np.linalg.det(u) * np.linalg.det(vt)
+    u[:, 2] *= handedness  # no reflection
     return np.ascontiguousarray(u @ vt)
 
 
@@ -310,5 +350,6 @@ def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:
     phi = np.empty(3)
     commutator = cross(rate1, rate2)
     for i in range(3):
-        phi[i] = 0.5 * (rate1[i] + rate2[i]) * dt + commutator[i] * dt * dt / 12.0
+        turned = 0.5 * (rate1[i] + rate2[i]) * dt
+        phi[i] = turned + commutator[i] * dt * dt / 12.0
     return phi

@@ -216,15 +216,17 @@ def roots_in_unit_interval(p: Array, zoom: float, roots: Array, half_gaps: Array
 
 def half_angle_nodes(degree: int) -> Array:
     """Cosine and sine (2n + 1, 2) of the half angles of the samples of D."""
-    half = np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
+    count = 2 * degree + 1
+    half = np.pi * np.arange(count) / count
     return np.stack([np.cos(half), np.sin(half)], axis=1)
 
 
 def half_angle_matrix(degree: int) -> Array:
     """Matrix (2n + 1, 2n + 1) from samples to ascending coefficients in x, at zoom 1."""
-    c, s = half_angle_nodes(degree).T[:, :, None]
+    cosine, sine = half_angle_nodes(degree).T[:, :, None]
     power = np.arange(2 * degree + 1)
-    return np.linalg.inv(c ** (2 * degree - power) * s**power)
+    samples_by_coefficients = cosine ** (2 * degree - power) * sine**power
+    return np.linalg.inv(samples_by_coefficients)
 
 
 @kernel
