@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.calibration_tracks import Recorded
-from rs_relpose_ros.calibrate import acceptance, procedure
+from rs_relpose_ros.calibrate import acceptance, evaluation
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
 from rs_relpose_ros.calibration import model
@@ -162,7 +162,7 @@ def test_a_camera_matrix_of_another_resolution_is_named(principal_point, is_name
     off[model.FOCAL] = np.log(0.5)
     off[model.CENTER] = np.array([principal_point, 359.5]) - [1279.5, 719.5]
     camera = replace(camera, cx=principal_point)
-    found = procedure._of_another_resolution(camera, off)
+    found = evaluation._of_another_resolution(camera, off)
     assert ('another resolution, 2.00 times as large' in found) == is_named
 
 

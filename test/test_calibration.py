@@ -16,14 +16,10 @@ from scipy.stats import norm, t
 from rs_relpose_lab.experiments import calibration as benchmark
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
-from rs_relpose_ros.calibrate import procedure
-from rs_relpose_ros.calibrate.procedure import (
-    calibrate,
-    calibrate_together,
-    CalibrationInput,
-    evaluated,
-    within_priors,
-)
+from rs_relpose_ros.calibrate import evaluation
+from rs_relpose_ros.calibrate.evaluation import evaluated, within_priors
+from rs_relpose_ros.calibrate.procedure import calibrate, calibrate_together
+from rs_relpose_ros.calibrate.recording import CalibrationInput
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.calibration import fit as fitting
 from rs_relpose_ros.calibration import knowledge, model, observations
@@ -911,7 +907,7 @@ def test_exposure_is_not_given_where_it_would_average_the_noise():
     gyro = GyroSeries(source.gyro.stamps_ns, rates)
     data = observations.Observations.of(source.tracks, gyro, camera_of(source.truth))
     final, _ = fitted(free_of(), gyro=gyro)
-    exposure = procedure._exposure(data, final, 1e-5)
+    exposure = evaluation._exposure(data, final, 1e-5)
     assert not exposure.observable and 'noise' in exposure.remark
     assert exposure.value <= exposure.sigma == data.interval
 

@@ -16,7 +16,7 @@ import yaml
 
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
-from rs_relpose_ros.calibrate import procedure
+from rs_relpose_ros.calibrate import procedure, recording
 from rs_relpose_ros.calibration.observations import GyroSeries, TrackedPoints
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
@@ -67,7 +67,7 @@ def test_the_chosen_tracker_is_used(bag, tmp_path, monkeypatch, refused):
     def refuse(config: TrackingConfig) -> None:
         raise InputError(f'a tracker of {config.detector}')
 
-    monkeypatch.setattr(procedure, 'make_tracker', refuse)
+    monkeypatch.setattr(recording, 'make_tracker', refuse)
     refused('a tracker of sift', 'calibrate', bag, '--out', tmp_path, '--detector', 'sift')
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rs_relpose_lab.experiments.calibration_tracks import Recorded
-from rs_relpose_ros.calibrate.procedure import calibrate, calibrate_together, CalibrationInput
+from rs_relpose_ros.calibrate.procedure import calibrate, calibrate_together
+from rs_relpose_ros.calibrate.recording import CalibrationInput
 from rs_relpose_ros.calibrate.result import as_mapping, CalibrationResult, parameter_file, report
 from rs_relpose_ros.calibration.offset_course import OffsetCourse, OffsetStep
 from rs_relpose_ros.config.settings import CalibrationConfig

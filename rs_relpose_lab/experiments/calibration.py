@@ -12,7 +12,8 @@ from scipy.stats import chi2
 
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.calibrate.procedure import CalibrationInput, read_recording
+from rs_relpose_ros.calibrate.procedure import calibrated
+from rs_relpose_ros.calibrate.recording import CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate
 from rs_relpose_ros.calibration.observations import TrackedPoints
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
@@ -84,7 +85,7 @@ def calibrated_parts(
     """Calibration of each part; `refused` gets the reason why one cannot be used."""
     for begin, tracks in parts_of(recording.tracks, seconds):
         try:
-            result = replace(recording, tracks=tracks).calibrated(TRACKED_IN_IMAGES)
+            result = calibrated(replace(recording, tracks=tracks), TRACKED_IN_IMAGES)
         except InputError as error:
             refused(f'{name} from {begin:.0f} s: {error}')
             continue

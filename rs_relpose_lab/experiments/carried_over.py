@@ -17,11 +17,8 @@ from rs_relpose_lab.experiments.consistency import (
 from rs_relpose_lab.experiments.true_pairs import read_truth, TruePath
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.sensor_topics import COMPRESSED_IMAGE
-from rs_relpose_ros.calibrate.procedure import (
-    calibrate_together,
-    CalibrationInput,
-    read_recording,
-)
+from rs_relpose_ros.calibrate.procedure import calibrate_together, calibrated
+from rs_relpose_ros.calibrate.recording import CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import parameter_file
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
@@ -81,7 +78,7 @@ def _calibration_of(bags: Sequence[Path], images: range | None, lens_known: bool
     recordings = [recording for recording, _, _ in read]
     _, quat_prior, compressed = read[0]
     if len(recordings) == 1:
-        result = recordings[0].calibrated(TRACKED_IN_IMAGES, quat_prior=quat_prior)
+        result = calibrated(recordings[0], TRACKED_IN_IMAGES, quat_prior=quat_prior)
     else:
         together = calibrate_together(recordings, TRACKED_IN_IMAGES, quat_prior=quat_prior)
         result = together.result

@@ -13,7 +13,8 @@ import time
 from typing import Any
 
 from rs_relpose_ros.calibrate import stored
-from rs_relpose_ros.calibrate.procedure import CalibrationInput, Recorder, warm_up_fit
+from rs_relpose_ros.calibrate.procedure import calibrated, warm_up_fit
+from rs_relpose_ros.calibrate.recording import CalibrationInput, Recorder
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.settings import Parameters, TRACKED_IN_IMAGES
@@ -343,7 +344,7 @@ def _serve() -> None:
             return
         result: CalibrationResult | RsRelposeError
         try:
-            result = recording.calibrated(config, quat_prior=quat_prior)
+            result = calibrated(recording, config, quat_prior=quat_prior)
         except RsRelposeError as error:
             result = error
         pickle.dump(result, sys.stdout.buffer)

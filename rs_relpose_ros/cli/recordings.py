@@ -15,7 +15,8 @@ from rs_relpose_ros.bags.convert.recording import Recording, write_bag
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.sensor_topics import COMPRESSED_IMAGE
 from rs_relpose_ros.calibrate import result as calibration
-from rs_relpose_ros.calibrate.procedure import calibrate_together, CalibrationInput, read_recording
+from rs_relpose_ros.calibrate.procedure import calibrate_together, calibrated
+from rs_relpose_ros.calibrate.recording import CalibrationInput, read_recording
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
@@ -105,7 +106,8 @@ def _fitted(
             bar.update(round(100 * share) - bar.n)
 
         if len(read) == 1:
-            return recordings[0].calibrated(config, quat_prior=quat_prior, progress=progress), {}
+            alone = calibrated(recordings[0], config, quat_prior=quat_prior, progress=progress)
+            return alone, {}
         common = calibrate_together(recordings, config, quat_prior=quat_prior, progress=progress)
     of_bags = [
         {'bag': one.path.name, **calibration.as_mapping(own, one.recording.camera)}

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.sensor_topics import SensorTopics
-from rs_relpose_ros.calibrate.procedure import read_recording, Recorder
+from rs_relpose_ros.calibrate import procedure
+from rs_relpose_ros.calibrate.recording import read_recording, Recorder
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibration import findings
 from rs_relpose_ros.calibration.findings import (
@@ -246,7 +247,7 @@ def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calibr
             focal_known=True,
             camera=given.of_image(camera.width, camera.height).global_shutter_camera(),
         )
-    return recording.calibrated(settings.TRACKED_IN_IMAGES)
+    return procedure.calibrated(recording, settings.TRACKED_IN_IMAGES)
 
 
 def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Completion:
@@ -380,7 +381,7 @@ def found_offset(
     gyro = recording.gyro
     shift_ns = to_nanoseconds(apart)
     shifted = replace(recording, gyro=replace(gyro, stamps_ns=gyro.stamps_ns - shift_ns))
-    found = shifted.calibrated(settings.TRACKED_IN_IMAGES)
+    found = procedure.calibrated(shifted, settings.TRACKED_IN_IMAGES)
     if not found.time_offset.observable:
         return None
     of_stamped_row = _offset_of_row(found, parameters.sensor.stamp_row)
