@@ -145,6 +145,11 @@ def _configured_sigmas(parameters: Parameters) -> Array:
 
 def by_gyro_matrix(rate: Array) -> Array:
     """Derivative (3, 6) of the true rate by scale and skew of the gyro, at a rate (3,)."""
-    x, y, z = rate
-    skew = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
-    return np.hstack([np.diag(rate), skew])
+    x, y, z = rate.tolist()
+    return np.array(
+        [
+            [x, 0.0, 0.0, 0.0, z, y],
+            [0.0, y, 0.0, z, 0.0, x],
+            [0.0, 0.0, z, y, x, 0.0],
+        ]
+    )

@@ -54,10 +54,16 @@ _INTEGRATION = 1e-4
 # Share of right loops within the bound of chi squared: 1 % of them are lost.
 # [chosen: 0.95 to 0.999 would do; measured with 0.99 in docs/lab/odometry.md, "Loop closures"]
 _LOOP_QUANTILE = 0.99
+# Number of the unknowns of `deviations`. [derived: the columns of its derivatives]
+_WIDTH = COLUMNS['mount'].stop
 # Columns of the derivatives of a pair, by the keys of the two bodies.
 _OF_BODIES = tuple(COLUMNS[key] for key in ('X1', 'V1', 'X2', 'V2'))
 # Columns of the derivatives of an IMU factor, by its keys; those of `doubts` follow.
 IMU = slices({'X1': 6, 'V1': 3, 'X2': 6, 'V2': 3, 'B1': 6, 'B2': 6})
+# Columns of all of these. [derived: two bodies]
+_IMU_COLUMNS = IMU['B2'].stop
+# The same by key.
+_OF_KEYFRAMES = tuple(IMU.values())
 # Number of equations of an IMU factor. [derived: pose, velocity and biases of one body]
 _IMU_ROWS = 15
 # Columns of the biases of the gyro, which follow those of the accelerometer.
@@ -105,46 +111,95 @@ class Motion(NamedTuple):
     R: Array  # (3, 3) of the body at the end
 
 
-def imu_factor(
-    k: int,
-    pim: Any,
-    motion: Motion,
-    unknown: Doubts,
-) -> Any:
-    """The samples between the keyframes k and k + 1.
+class ImuResiduals:
+    """Residuals of the samples between the keyframes k and k + 1, and their derivatives.
 
-    `pim`: ``gtsam.PreintegratedCombinedMeasurements``. The gyro matrix changes the rate by
-    ``M rate``, as a change of the bias by ``-M rate`` does: the residual is linear in it to 1e-6
-    rad. A lag changes the integrals of the specific force.
+    The gyro matrix changes the rate by ``M rate``, as a change of the bias by ``-M rate`` does:
+    the residual is linear in it to 1e-6 rad. A lag changes the integrals of the specific force.
+    The optimiser asks several times at the same values: the last answer is remembered.
     """
-    x1, v1, b1 = X(k), V(k), B(k)
-    x2, v2, b2 = X(k + 1), V(k + 1), B(k + 1)
-    inner = gtsam.CombinedImuFactor(x1, v1, x2, v2, b1, b2, pim)
-    common, sensors = L(0), unknown.sensors
-    by_matrix = -by_gyro_matrix(motion.rate)
-    velocity_by_lag, position_by_lag = motion.by_lag
-    place_by_lag = motion.R.T @ position_by_lag
-    blocks = tuple(IMU.values())
 
-    def error(
+    def __init__(
+        self,
+        k: int,
+        pim: Any,
+        motion: Motion,
+        unknown: Doubts,
+    ) -> None:
+        """`pim`: ``gtsam.PreintegratedCombinedMeasurements``, of which a copy is kept."""
+        first = X(k), V(k)
+        second = X(k + 1), V(k + 1)
+        biases = B(k), B(k + 1)
+        self._keys = [*first, *second, *biases, L(0)]
+        self._inner = gtsam.CombinedImuFactor(*first, *second, *biases, pim)
+        self._unknown = unknown
+        # Change (30, 7) of the unknowns of the keyframes that has the effect of `sensors`.
+        by_matrix = -by_gyro_matrix(motion.rate)
+        velocity_by_lag, position_by_lag = motion.by_lag
+        by_sensors = np.zeros((_IMU_COLUMNS, by_matrix.shape[1] + 1))
+        by_sensors[_OF_GYRO_1, :-1] = by_sensors[_OF_GYRO_2, :-1] = by_matrix
+        by_sensors[_OF_VELOCITY_2, -1] = -velocity_by_lag
+        by_sensors[_OF_PLACE_2, -1] = -motion.R.T @ position_by_lag
+        self._by_sensors = by_sensors
+        self._at = b''
+        self._residual = np.zeros(0)
+        self._by_keyframes = np.zeros((0, 0))
+        self._by_doubts = np.zeros((0, 0))
+
+    def factor(self) -> Any:
+        """The residuals as a factor of a graph."""
+        noise = gtsam.noiseModel.Unit.Create(_IMU_ROWS)
+        return gtsam.CustomFactor(noise, self._keys, self._error)
+
+    def derivatives(self, values: Any) -> tuple[Array, Array]:
+        """Derivatives (15, 30) by the unknowns of both keyframes, as `IMU`, and by `doubts`."""
+        self._evaluate(values)
+        return self._by_keyframes, self._by_doubts
+
+    def _error(
+        self,
         _: Any,
         values: Any,
         jacobians: Any,
     ) -> Array:
-        A, negative = inner.linearize(values).jacobian()
-        of_matrix = (A[:, _OF_GYRO_1] + A[:, _OF_GYRO_2]) @ by_matrix
-        of_lag = A[:, _OF_VELOCITY_2] @ velocity_by_lag + A[:, _OF_PLACE_2] @ place_by_lag
-        of_sensors = np.column_stack([of_matrix, -of_lag])
+        """The residual in its sigmas, as gtsam asks for it."""
+        self._evaluate(values)
         if jacobians is not None:
-            for number, columns in enumerate(blocks):
-                jacobians[number] = np.asfortranarray(A[:, columns])
-            by_doubts = np.zeros((_IMU_ROWS, unknown.size), order='F')
-            by_doubts[:, sensors] = of_sensors
-            jacobians[len(blocks)] = by_doubts
-        return np.asarray(of_sensors @ values.atVector(common)[sensors] - negative)
+            for number, columns in enumerate(_OF_KEYFRAMES):
+                jacobians[number] = self._by_keyframes[:, columns]
+            jacobians[len(_OF_KEYFRAMES)] = self._by_doubts
+        return self._residual
 
-    noise = gtsam.noiseModel.Unit.Create(_IMU_ROWS)
-    return gtsam.CustomFactor(noise, [x1, v1, x2, v2, b1, b2, common], error)
+    def _evaluate(self, values: Any) -> None:
+        """Remember residual and derivatives at the values of a graph."""
+        x1, v1, x2, v2, b1, b2, common = self._keys
+        d = values.atVector(common)
+        at = _remembered(
+            values.atPose3(x1).matrix(),
+            values.atPose3(x2).matrix(),
+            values.atVector(v1),
+            values.atVector(v2),
+            values.atConstantBias(b1).vector(),
+            values.atConstantBias(b2).vector(),
+            d,
+        )
+        if at == self._at:
+            return
+        # Column-major, as gtsam requires of derivatives.
+        A, negative = self._inner.linearize(values).jacobian()
+        of_sensors = A @ self._by_sensors
+        sensors = self._unknown.sensors
+        by_doubts = np.zeros((_IMU_ROWS, self._unknown.size), order='F')
+        by_doubts[:, sensors] = of_sensors
+        self._residual = of_sensors @ d[sensors] - negative
+        self._by_keyframes = A
+        self._by_doubts = by_doubts
+        self._at = at
+
+
+def _remembered(*values: Array) -> bytes:
+    """The values as something that is compared at once."""
+    return b''.join([value.tobytes() for value in values])
 
 
 def changed_bias(bias: Any, change: Array) -> Any:
@@ -197,11 +252,21 @@ class _PairResiduals:
         self._root, self._offset = square_root(images.information, images.gradient)
         self._measured = Measured.of(pair)
         self.rows, self._size = self._root.shape
+        # Derivative (25, n) of the unknowns of `deviations` by those of the keys.
+        first = _OF_BODIES[-1].stop
+        by_keys = np.eye(_WIDTH, first + unknown.size)
+        by_keys[first:] = 0.0
+        of_doubts = by_keys[:, first:]
+        of_doubts[COLUMNS['arm'], doubts.ARM] = np.eye(3)
+        of_doubts[COLUMNS['mount'], unknown.images] = unknown.by_mount
+        self._by_keys = by_keys
+        self._columns = (*_OF_BODIES, slice(first, None))
         # The estimate of the images moves with the deviations, too.
-        self._by_images = np.zeros((self._size, len(unknown.active)))
+        self._by_images = np.zeros((self._size, by_keys.shape[1]))
         if images.by_deviation is not None:
-            self._by_images = images.by_deviation[:, unknown.active]
-        self._at = np.zeros(0)
+            of_images = self._by_images[:, first:][:, unknown.images]
+            of_images[:] = images.by_deviation[:, unknown.active]
+        self._at = b''
         self._residual = np.zeros(0)
         self._derivatives: list[Array] = []
 
@@ -216,8 +281,8 @@ class _PairResiduals:
         pose1, pose2 = values.atPose3(x1).matrix(), values.atPose3(x2).matrix()
         velocity1, velocity2 = values.atVector(v1), values.atVector(v2)
         d = values.atVector(common)
-        at = np.concatenate([pose1.ravel(), pose2.ravel(), velocity1, velocity2, d])
-        if not np.array_equal(at, self._at):
+        at = _remembered(pose1, pose2, velocity1, velocity2, d)
+        if at != self._at:
             rates, forces = self._motions
             first = Body.of(pose1, velocity1, rates[0], forces[0])
             second = Body.of(pose2, velocity2, rates[1], forces[1])
@@ -234,19 +299,12 @@ class _PairResiduals:
         axes, delay = unknown.mount(d)
         arm = d[doubts.ARM].copy()
         mount = Mount(unknown.R_cam_body_configured, arm, axes, delay)
-        all_errors, all_by = deviations(first, second, mount, self._measured)
-        by = all_by[:n]
-        of_images = self._by_images @ d[unknown.images]
-        errors = all_errors[:n] - of_images
-        whole = (by.T @ self._root.T).T  # column-major, as gtsam requires
-        of_mount = by[:, COLUMNS['mount']]
-        by_others = of_mount @ unknown.by_mount - self._by_images
-        by_doubts = np.zeros((self.rows, unknown.size), order='F')
-        by_doubts[:, doubts.ARM] = whole[:, COLUMNS['arm']]
-        by_doubts[:, unknown.images] = self._root @ by_others
-        self._derivatives = [whole[:, columns] for columns in _OF_BODIES]
-        self._derivatives.append(by_doubts)
-        self._residual = self._root @ errors + self._offset
+        errors, by = deviations(first, second, mount, self._measured)
+        moved = errors[:n] - self._by_images[:, self._columns[-1]] @ d
+        by_unknowns = by[:n] @ self._by_keys - self._by_images
+        whole = (by_unknowns.T @ self._root.T).T  # column-major, as gtsam requires
+        self._derivatives = [whole[:, columns] for columns in self._columns]
+        self._residual = self._root @ moved + self._offset
 
 
 def still_factor(

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration.findings import Finding
 from rs_relpose_ros.config.settings import Parameters
@@ -29,6 +28,7 @@ from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.messages.published_pair import PublishedPair
 from rs_relpose_ros.odometry import doubts, factors
 from rs_relpose_ros.odometry.doubts import by_gyro_matrix, Doubts
+from rs_relpose_ros.odometry.marginals import CommonCovariances, joint_covariance
 from rs_relpose_ros.odometry.noise import (
     Innovation,
     integrals_of_noise,
@@ -91,6 +91,8 @@ _SMOOTHING_ITERATIONS = 10
 # [measured: others change no path by 0.1 mm, docs/lab/odometry.md, "As a process"]
 _ERROR_TOLERANCE = 1e-4
 
+# Against a division by zero, in a rotation by no angle.
+_TINY = 1e-300
 # Covariance of three values of unit variance.
 _EYE = np.eye(3)
 
@@ -98,8 +100,6 @@ _EYE = np.eye(3)
 _OF_FIRST = np.r_[factors.IMU['X1'], factors.IMU['V1'], factors.IMU['B1']]
 # The same of its second keyframe.
 _OF_SECOND = np.r_[factors.IMU['X2'], factors.IMU['V2'], factors.IMU['B2']]
-# The same of `doubts`.
-_OF_DOUBTS = slice(factors.IMU['B2'].stop, None)
 # Columns of the covariance of a keyframe; the vector of `doubts` follows.
 _KEYFRAME = slices({'pose': 6, 'velocity': 3, 'accel_bias': 3, 'gyro_bias': 3, 'arm': 3})
 POSE = _KEYFRAME['pose']  # both, rotation first
@@ -150,13 +150,9 @@ class Loop(NamedTuple):
 class _Step(NamedTuple):
     """Samples since the newest keyframe."""
 
-    interval: ImuInterval | None
+    interval: ImuInterval
     pim: Any  # their integral, of gtsam
-    motion: factors.Motion
-
-
-# No samples.
-_NO_STEP = _Step(None, None, factors.Motion(np.zeros(3), np.zeros((2, 3)), np.eye(3)))
+    residuals: factors.ImuResiduals
 
 
 def _optimizer(iterations: int) -> Any:
@@ -196,7 +192,7 @@ class KeyframeGraph:
         self._noise = NoisePosterior()
         # Squared density of the gyro's noise before innovations show more.
         self._gyro_variance = self._imu.gyro_noise_density**2
-        self._step = _NO_STEP
+        self._step: _Step | None = None
         self._smoother = self._new_smoother()
         # All factors and states since the start, for the final smoothing.
         self._record = (gtsam.NonlinearFactorGraph(), gtsam.Values()) if keep else None
@@ -255,7 +251,7 @@ class KeyframeGraph:
         self.newest = state
         pose = gtsam.Pose3(gtsam.Rot3(state.R), state.position)
         self._nav_state = gtsam.NavState(pose, state.velocity)
-        self._step = _NO_STEP
+        self._step = None
 
     def add(
         self,
@@ -282,7 +278,7 @@ class KeyframeGraph:
         values.insert(X(j), self._ahead.atPose3(X(j)))
         values.insert(V(j), self._ahead.atVector(V(j)))
         values.insert(B(j), self._bias)
-        graph.add(self._imu_factor(step))
+        graph.add(step.residuals.factor())
         innovation = 0.0
         if pair is not None and pair.images is not None:
             motions = self._motions(interval)
@@ -339,7 +335,6 @@ class KeyframeGraph:
         still = factors.still_factor(i, j, sigma, self._doubts)
         motion = self._innovation(step, still)
         largest_variance = np.linalg.norm(motion.covariance, 2)
-        assert step.interval is not None
         speed_sigma = sigma * math.sqrt(largest_variance) / step.interval.duration
         agrees = motion.chi_squared <= _STILL_GATE
         if certain or (agrees and speed_sigma < _STILL_SPEED):
@@ -392,8 +387,10 @@ class KeyframeGraph:
     def smoothed(self) -> list[KeyframeState]:
         """All keyframes since the start, given all measurements; needs `keep`."""
         with _solving():
-            values, marginals = self._smoothed()
-            return [_state(values, k, _joint(marginals, _keys(k))) for k in range(self._count)]
+            graph, values = self._smoothed()
+            # An IMU factor has all unknowns of a keyframe.
+            covariances = CommonCovariances(graph, values)
+            return [_state(values, k, covariances.of(_keys(k))) for k in range(self._count)]
 
     def add_loops(self, loops: Sequence[Loop]) -> list[Loop]:
         """Add pairs of keyframes far apart to what is smoothed, and return those that count.
@@ -402,7 +399,8 @@ class KeyframeGraph:
         all of them; needs `keep`.
         """
         with _solving():
-            values, marginals = self._smoothed()
+            graph, values = self._smoothed()
+            marginals = gtsam.Marginals(graph, values)
             misfits = [self._misfit(loop, values, marginals) for loop in loops]
             bound = 1.0
             while True:
@@ -473,25 +471,21 @@ class KeyframeGraph:
         return loop._replace(pair=replace(loop.pair, images=predicted))
 
     def _smoothed(self) -> tuple[Any, Any]:
-        """Values and marginals of the whole record."""
+        """The whole record with the values that fit it."""
         assert self._record is not None
         graph, values = self._record
-        values = _optimized(graph, values)
-        return values, gtsam.Marginals(graph, values)
-
-    def _imu_factor(self, step: _Step) -> Any:
-        """The samples of a step as a factor."""
-        return factors.imu_factor(self._count - 1, step.pim, step.motion, self._doubts)
+        return graph, _optimized(graph, values)
 
     def _predicted(self, interval: ImuInterval) -> _Step:
         """Predict the next keyframe in `_ahead`.
 
         By the mean of two samples each; those of the prediction before are not repeated.
         """
-        known, pim, _ = self._step
+        known = self._step
         first = 0
-        if known is not None and _continues(interval, known):
-            first = len(known.seconds) - 1
+        if known is not None and _continues(interval, known.interval):
+            pim = known.pim
+            first = len(known.interval.seconds) - 1
         else:
             pim = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
         new = ImuInterval(
@@ -511,7 +505,9 @@ class KeyframeGraph:
         pose = gtsam.Pose3(R, state.position() + position)
         self._ahead.update(X(self._count), pose)
         self._ahead.update(V(self._count), state.velocity() + velocity)
-        self._step = _Step(interval, pim, factors.Motion(rate, by_lag, R.matrix()))
+        motion = factors.Motion(rate, by_lag, R.matrix())
+        residuals = factors.ImuResiduals(self._count - 1, pim, motion, self._doubts)
+        self._step = _Step(interval, pim, residuals)
         return self._step
 
     def _integrate(self, pim: Any, interval: ImuInterval) -> None:
@@ -537,12 +533,10 @@ class KeyframeGraph:
 
         Both are of the size of the covariance of a keyframe.
         """
-        factor = self._imu_factor(step)
         # A_i d_i + A_j d_j + A_d d is white noise.
-        A, _ = factor.linearize(self._ahead).jacobian()
+        A, of_doubts = step.residuals.derivatives(self._ahead)
         first = A[:, _OF_FIRST]
         second = A[:, _OF_SECOND]
-        of_doubts = A[:, _OF_DOUBTS]
         back = np.linalg.inv(second)
         size = len(self.newest.covariance)
         by = np.eye(size)
@@ -583,7 +577,6 @@ class KeyframeGraph:
         `second`: derivatives (n, m) by the second body, whose rotation, velocity and position the
         noise changes. A rotation turns the mean specific force.
         """
-        assert step.interval is not None
         pose = self._ahead.atPose3(X(self._count))
         R = pose.rotation().matrix()
         of_rotation = second[:, ROTATION]
@@ -630,9 +623,9 @@ class KeyframeGraph:
     def _read(self, newest: int) -> None:
         """Read the estimates of the smoother."""
         values = self._smoother.calculateEstimate()
-        window = self._smoother.getFactors()
+        covariance = joint_covariance(self._smoother.getFactors(), values, _keys(newest))
         self._values = values
-        self.newest = _state(values, newest, _window_covariance(window, values, newest))
+        self.newest = _state(values, newest, covariance)
         pose = values.atPose3(X(newest))
         velocity = values.atVector(V(newest))
         self._bias = values.atConstantBias(B(newest))
@@ -643,7 +636,7 @@ class KeyframeGraph:
         ahead.insert(V(newest + 1), velocity)
         ahead.insert(B(newest + 1), self._bias)
         self._ahead = ahead
-        self._step = _NO_STEP
+        self._step = None
         if self._record is not None:
             self._record[1].insert_or_assign(values)
 
@@ -655,13 +648,19 @@ def _by_lag(interval: ImuInterval, turn: Array) -> Array:
     interval. The true force is later in the samples: its derivative is integrated.
     """
     seconds = interval.seconds - interval.seconds[0]
-    steps = np.diff(seconds)
-    middle = seconds[:-1] + 0.5 * steps
-    turns = Rotation.from_rotvec(np.outer(middle / seconds[-1], turn))
-    changes = turns.apply(np.diff(interval.forces, axis=0))
-    velocity = np.cumsum(changes, axis=0)
-    position = steps @ (velocity - 0.5 * changes)
-    return np.stack([velocity[-1], position])
+    duration = seconds[-1]
+    middle = 0.5 * (seconds[1:] + seconds[:-1])
+    changes = interval.forces[1:] - interval.forces[:-1]
+    # A change counts for the velocity, and for the position as long as it lasts.
+    weights = np.array([np.ones(len(middle)), duration - middle])
+    # Each change turns about one axis, in proportion to time (Rodrigues' formula).
+    angle = math.sqrt(turn @ turn)
+    axis = turn / max(angle, _TINY)
+    angles = middle * (angle / duration)
+    cosines = np.cos(angles)
+    along = (weights * (1.0 - cosines)) @ (changes @ axis)
+    across = (weights * np.sin(angles)) @ changes
+    return np.asarray((weights * cosines) @ changes - across @ skew(axis) + np.outer(along, axis))
 
 
 def _ways(values: Any, newest: int) -> Array:
@@ -681,15 +680,16 @@ def _longest_share(changes: Array, ways: Array) -> float:
 
 def _mean_rate(interval: ImuInterval) -> Array:
     """Mean (3,) of the rates over the time of an interval."""
-    steps = np.diff(interval.seconds)
-    means = 0.5 * (interval.rates[1:] + interval.rates[:-1])
-    return np.asarray(steps @ means / steps.sum())
+    seconds = interval.seconds
+    steps = seconds[1:] - seconds[:-1]
+    sums = interval.rates[1:] + interval.rates[:-1]
+    return np.asarray(0.5 * steps @ sums / steps.sum())
 
 
 def _continues(interval: ImuInterval, known: ImuInterval) -> bool:
     """Whether an interval begins with all samples of another one."""
     pairs = zip(known, interval, strict=True)
-    return all(np.array_equal(old, new[: len(old)]) for old, new in pairs)
+    return all(old.tobytes() == new[: len(old)].tobytes() for old, new in pairs)
 
 
 @contextmanager
@@ -719,28 +719,6 @@ def _state(values: Any, k: int, covariance: Array) -> KeyframeState:
 def _keys(k: int) -> list[int]:
     """The unknowns of a keyframe in the order of its covariance."""
     return [X(k), V(k), B(k), L(0)]
-
-
-def _window_covariance(window: Any, values: Any, newest: int) -> Array:
-    """Covariance of the unknowns of the newest keyframe, given the factors of a window.
-
-    ``gtsam.Marginals`` squares the condition of the equations, which is too large after a loss:
-    position and heading are known to decimetres then, each step to fractions of a millimetre.
-    """
-    keys = _keys(newest)
-    try:
-        return _joint(gtsam.Marginals(window, values), keys)
-    except RuntimeError:
-        pass
-    known = gtsam.Values.keys(values)
-    ordering = gtsam.Ordering()
-    for key in [*(key for key in known if key not in keys), *keys]:
-        ordering.push_back(key)
-    A, _ = window.linearize(values).jacobian(ordering)
-    size = sum(values.atVector(L(0)).shape) + _OWN.stop
-    root = np.linalg.qr(A).R[-size:, -size:]
-    back = np.linalg.inv(root)
-    return np.asarray(back @ back.T)
 
 
 def _joint(marginals: Any, keys: list[int]) -> Array:

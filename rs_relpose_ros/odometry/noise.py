@@ -55,6 +55,9 @@ _LEAST_NAMED = 20
 # smaller bound would take them for knocks, a larger one would trust a knock.
 # [chosen: 15 to 40 would do: hand-held walks reach 5, knocks 50 to 200]
 _KNOCK = 20.0
+# Least share of a vector's length in the largest of its three components. A larger one would miss
+# knocks. [derived: all three are equal]
+_LEAST_COMPONENT = 0.57
 # Samples before and after a knock that are as uncertain: it lasts for 5 to 15 ms.
 # [chosen: 1 to 3 would do at 200 Hz]
 _AROUND_KNOCK = 2
@@ -246,11 +249,12 @@ def knocks(interval: ImuInterval) -> Array:
 
     The peak of a knock is between the samples, or beyond the range of the accelerometer.
     """
-    jumps = np.linalg.norm(np.diff(interval.forces, axis=0), axis=1)
-    sigmas = np.zeros(len(jumps))
-    numbers = np.flatnonzero(jumps > _KNOCK)
-    if not len(numbers):
+    changes = interval.forces[1:] - interval.forces[:-1]
+    sigmas = np.zeros(len(changes))
+    if np.abs(changes).max(initial=0.0) <= _LEAST_COMPONENT * _KNOCK:
         return sigmas
+    jumps = np.linalg.norm(changes, axis=1)
+    numbers = np.flatnonzero(jumps > _KNOCK)
     sizes = np.linalg.norm(interval.forces, axis=1)
     for k in numbers:
         first = max(k - _AROUND_KNOCK, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,7 @@ class Stamp(NamedTuple):
     corrections: int  # of the keyframe, since the first start
 
 
+@lru_cache(maxsize=16)  # of each state; the number changes with a pair
 def untested_scale(pairs: int) -> float:
     """Factor of a covariance whose own size is known from so many pairs.
 
@@ -99,8 +101,9 @@ class Publication(NamedTuple):
         # It is at the origin at first: p + (R - R_first) c, in the world.
         position = body.position + (body.R - self.origin_axes) @ arm
         velocity = R.T @ (body.velocity + body.R @ skew(rate) @ arm)
-        to_world = self._pose_by_body(body, arm, R_cam_body)
-        to_twist = self._twist_by_body(body, arm, rate, velocity, R_cam_body)
+        by_axes = self._by_axes(len(body.covariance))
+        to_world = self._pose_by_body(body, arm, R_cam_body, by_axes)
+        to_twist = self._twist_by_body(body, arm, rate, velocity, R_cam_body, by_axes)
         matrix = self.unknown.gyro_matrix
         columns = slice(DOUBTS.start + matrix.start, DOUBTS.start + matrix.stop)
         to_twist[:, columns] -= to_twist[:, GYRO_BIAS] @ by_matrix
@@ -138,15 +141,19 @@ class Publication(NamedTuple):
         body: KeyframeState,
         arm: Array,
         R_cam_body: Array,
+        by_axes: Array,
     ) -> Array:
-        """Derivative (6, n) of position and rotation by the unknowns of a keyframe."""
-        n = len(body.covariance)
+        """Derivative (6, n) of position and rotation by the unknowns of a keyframe.
+
+        `by_axes`: as `_by_axes`.
+        """
         # The camera's axes turn the base about the camera: derivatives by these axes.
-        axes_on_body = -R_cam_body.T @ self._by_axes(n)
+        to_body = -R_cam_body.T
+        axes_on_body = to_body @ by_axes
         across = skew(self.base.R.T @ self.base.position)
-        arm_by_axes = -R_cam_body.T @ across @ self._by_axes(n)
+        arm_by_axes = to_body @ across @ by_axes
         moved = body.R - self.origin_axes
-        by = np.zeros((6, n))
+        by = np.zeros((6, by_axes.shape[1]))
         by[:3, ROTATION] = -body.R @ skew(arm)
         by[:3, TRANSLATION] = body.R
         by[:3, ARM] = moved
@@ -162,21 +169,25 @@ class Publication(NamedTuple):
         rate: Array,
         velocity: Array,
         R_cam_body: Array,
+        by_axes: Array,
     ) -> Array:
-        """Derivative (6, n) of velocity and rate of the base, in its axes."""
-        n = len(body.covariance)
+        """Derivative (6, n) of velocity and rate of the base, in its axes.
+
+        `by_axes`: as `_by_axes`.
+        """
         base_R = self.base.R
         C = base_R @ R_cam_body
-        by_axes = self._by_axes(n)
         across = skew(base_R.T @ self.base.position)
+        swing_by_arm = C @ skew(rate)
         arm_by_axes = -R_cam_body.T @ across @ by_axes
         velocity_on_body = body.R.T @ body.velocity
-        by = np.zeros((6, n))
+        base_by_axes = base_R @ by_axes
+        by = np.zeros((6, by_axes.shape[1]))
         by[:3, ROTATION] = C @ skew(velocity_on_body)
         by[:3, VELOCITY] = C @ body.R.T
-        by[:3, ARM] = C @ skew(rate)
+        by[:3, ARM] = swing_by_arm
         by[:3, GYRO_BIAS] = C @ skew(arm)
         by[3:, GYRO_BIAS] = -C
-        by[:3] += C @ skew(rate) @ arm_by_axes - skew(velocity) @ base_R @ by_axes
-        by[3:] -= skew(C @ rate) @ base_R @ by_axes
+        by[:3] += swing_by_arm @ arm_by_axes - skew(velocity) @ base_by_axes
+        by[3:] -= skew(C @ rate) @ base_by_axes
         return by

@@ -85,9 +85,11 @@ class PathEnd(NamedTuple):
 
     def of_pose(self, position: Array) -> Array:
         """Covariance (6, 6) of position and rotation at a position (3,), by the path end."""
+        x, y, _ = (position - self.position).tolist()
         by = np.zeros((6, _PLACE))
-        by[:3, :3] = np.eye(3)
-        by[:3, 3] = np.cross([0.0, 0.0, 1.0], position - self.position)
+        by[0, 0] = by[1, 1] = by[2, 2] = 1.0
+        by[0, 3] = -y  # z axis x way
+        by[1, 3] = x
         by[5, 3] = 1.0
         return np.asarray(by @ self.covariance @ by.T)
 
