@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros import estimate_relative_pose, EstimatorConfig, InputError, Status
 from rs_relpose_ros.core import reprojection
-from rs_relpose_ros.core.deviations import LENS, N_DEVIATIONS
+from rs_relpose_ros.core.deviations import LENS, N_DEVIATIONS, PARTS
+from rs_relpose_ros.core.rows import row_states, RowsOfFrames, turned_frames
 from rs_relpose_ros.estimator import adjustment, frames_between
 from rs_relpose_ros.estimator.arguments import IntermediateFrame
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.gyro import GyroPath
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import tangent_basis
 
@@ -32,6 +34,7 @@ ARM = np.array([0.03, -0.01, 0.02])
 SIGMA = 0.3  # of a pixel's coordinates
 GYRO_WALK, BIAS_SIGMA = 5e-4, 2e-3  # [rad/sqrt(s)], [rad/s]
 GRAVITY_ERROR = np.array([0.3, -0.5, 0.2])
+R_CAM_IMU = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
 
 
 class Motion:
@@ -282,10 +285,16 @@ def test_covariance_contains_errors_of_the_stamps_of_each_frame():
     assert np.mean(chi2[sigma]) < 1.4 and np.mean(chi2[0.0]) > 5.0
 
 
+def without_limit(sigma):
+    """Noise [px] with which all observations count."""
+    return reprojection.Noise(sigma * sigma, math.inf)
+
+
 def cost_of(state, arguments, sigma):
     tracks, priors, *_ = arguments
-    normal = adjustment.linearised(tracks, priors, state, sigma)
-    return adjustment._cost(normal, tracks, sigma)[0], normal
+    noise = reprojection.Noise(sigma**2, (adjustment._FARTHEST * sigma) ** 2)
+    normal = adjustment.linearised(tracks, priors, state, noise)
+    return adjustment._cost(normal, tracks, sigma, noise.farthest)[0], normal
 
 
 def test_derivatives_are_those_of_the_cost(fitted):
@@ -313,7 +322,7 @@ def converged(arguments, state):
     """The optimum with the noise held, by Gauss-Newton steps."""
     tracks, priors, _, expected, *_ = arguments
     for _ in range(6):
-        normal = adjustment.linearised(tracks, priors, state, expected)
+        normal = adjustment.linearised(tracks, priors, state, without_limit(expected))
         step = np.linalg.solve(normal.hessian, -normal.gradient)
         state = adjustment.moved_state(state, normal, step)
     return state
@@ -333,25 +342,51 @@ def from_state(state, other):
 
 
 def with_changes(tracks, changes, step):
-    """The observations after a step (D,) of the deviations."""
-    V = len(tracks.used)
-    N = tracks.number
+    """The observations after a step of the deviations (D,) and of the errors of each frame."""
+    V, N = changes.rows.times.shape
     rows = tracks.observations.copy()
     flat = np.moveaxis(rows, 2, 3).reshape(V, -1, reprojection.VALUES)
-    own = flat[:, :N]
-    later = (changes.times @ step)[..., None]
-    rays = own[..., reprojection.RAY : reprojection.RAY + 3]
-    of_lens = changes.lens @ step[LENS]
-    turned_lens = np.einsum('vnij,vnj->vni', changes.rows, of_lens)
-    rays += np.cross(changes.turns @ step, rays) + turned_lens
-    moving = own[..., reprojection.MOVING : reprojection.MOVING + 3]
-    own[..., reprojection.MOVED : reprojection.MOVED + 3] += later * moving
-    own[..., reprojection.TIME] += later[..., 0]
-    turned = Rotation.from_rotvec(changes.rotations @ step).as_matrix() @ tracks.rotations
+    for v in range(V):
+        first, end = changes.rows.first_knots[v : v + 2]
+        path = GyroPath(*(values[first:end] for values in changes.rows.path))
+        times = changes.rows.times[v]
+        states = row_states(path, R_CAM_IMU, times, changes.rows.shares[v])
+        of_frame = step[N_DEVIATIONS:].reshape(V, -1)[v]
+        rate = of_frame[:3] + of_frame[3] * changes.rate_changes[v]
+        turned = states.by_deviation @ step[:N_DEVIATIONS] + np.outer(times, rate)
+        later = states.time_by_deviation @ step[:N_DEVIATIONS] + of_frame[3]
+        of_lens = changes.lens[v] @ step[LENS]
+        own = flat[v, :N]
+        rays = own[:, reprojection.RAY : reprojection.RAY + 3]
+        by_turn = np.cross(turned, rays)
+        rays += by_turn + np.einsum('nij,nj->ni', states.rotation, of_lens)
+        moving = own[:, reprojection.MOVING : reprojection.MOVING + 3]
+        own[:, reprojection.MOVED : reprojection.MOVED + 3] += later[:, None] * moving
+        own[:, reprojection.TIME] += later
+    turns = changes.rotations @ step[:N_DEVIATIONS]
+    rotations = Rotation.from_rotvec(turns).as_matrix() @ tracks.rotations
     blocks = flat.reshape(V, -1, reprojection.BLOCK, reprojection.VALUES)
     return tracks._replace(
-        observations=np.ascontiguousarray(np.moveaxis(blocks, 3, 2)), rotations=turned
+        observations=np.ascontiguousarray(np.moveaxis(blocks, 3, 2)), rotations=rotations
     )
+
+
+def some_changes(V, N, rng):
+    """Rows of V frames that turn at changing rates, and arbitrary changes of all else."""
+    knots = np.linspace(-0.02, 0.03, 7)
+    parts = [GyroPath.integrated(knots, rng.normal(size=(7, 3))).about(0.0) for _ in range(V)]
+    rows = RowsOfFrames(
+        GyroPath(*(np.concatenate(values) for values in zip(*parts, strict=True))),
+        7 * np.arange(V + 1),
+        rng.uniform(-0.019, 0.029, (V, N)),
+        rng.uniform(-0.5, 0.5, (V, N)),
+    )
+    rotations = rng.normal(size=(V, 3, N_DEVIATIONS))
+    rotations[0] = 0.0
+    # Small, as its steps move the residuals the most.
+    lens = 0.2 * rng.normal(size=(V, 1, 3, LENS.stop - LENS.start)) * rng.normal(size=(1, N, 1, 1))
+    turned = turned_frames(rows, R_CAM_IMU)
+    return reprojection.Changes(rows, turned, rotations, lens, rng.normal(size=(V, 3)))
 
 
 def test_path_by_deviations_equals_finite_differences():
@@ -366,26 +401,18 @@ def test_path_by_deviations_equals_finite_differences():
     arguments = calls[0]
     tracks, priors, start, sigma, *_ = arguments
     state = converged(arguments, start)
-    rng = np.random.default_rng(1)
-    V = len(tracks.used)
-    N = tracks.number
-    D = N_DEVIATIONS
-    changes = reprojection.Changes(
-        np.zeros((V, N, 3, D)),
-        np.zeros((V, N, D)),
-        np.zeros((V, 3, D)),
-        Rotation.random(V * N, random_state=2).as_matrix().reshape(V, N, 3, 3),
-        np.zeros((V, N, 3, LENS.stop - LENS.start)),
-    )
-    changes.turns[..., 0] = rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
-    changes.times[..., 1] = rng.normal(size=(V, N))
-    changes.rotations[1:, :, 2] = rng.normal(size=(V - 1, 3))
-    # Small, as its steps move the residuals the most.
-    changes.lens[..., 1] = 0.2 * rng.normal(size=(V, 1, 3)) * rng.normal(size=(1, N, 1))
-    normal = adjustment.linearised(tracks, priors, state, sigma)
-    exact = adjustment.path_by_deviations(tracks, state, normal, changes)
+    V, N = len(tracks.used), tracks.number
+    changes = some_changes(V, N, np.random.default_rng(1))
+    normal = adjustment.linearised(tracks, priors, state, without_limit(sigma))
+    exact = adjustment.path_by_deviations(tracks, normal, changes)
+    assert exact.shape[1] == N_DEVIATIONS + reprojection.OF_FRAME * V
     sigmas = 1.0 / np.sqrt(np.diag(normal.hessian))
-    for step in 5e-6 * np.eye(D)[[0, 1, 2, LENS.start + 1]]:
+    of_frame = N_DEVIATIONS + reprojection.OF_FRAME * 2  # of the third one
+    parts = [part.start for part in PARTS.values()]
+    for column in (*parts, of_frame, of_frame + 3):
+        step = np.zeros(exact.shape[1])
+        # A step that moves the path by a small part of its sigma.
+        step[column] = 0.02 / np.abs(exact[:, column] / sigmas).max()
         up, down = (
             from_state(
                 state, converged((with_changes(tracks, changes, by), *arguments[1:]), state)

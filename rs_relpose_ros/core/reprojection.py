@@ -29,8 +29,17 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.core.deviations import LENS
 from rs_relpose_ros.core.least_squares import first_indices
+from rs_relpose_ros.core.rows import (
+    add_by_delay,
+    add_by_row,
+    part_of_frame,
+    RowsOfFrames,
+    RowState,
+    TurnedFrames,
+)
 from rs_relpose_ros.core.triangulate import scaled_depths
 from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.gyro import knot_before, write_state
 from rs_relpose_ros.geometry.so3 import (
     add,
     column,
@@ -85,18 +94,20 @@ BIAS = _UNKNOWNS['bias']  # b
 ACCELERATION = _UNKNOWNS['acceleration']  # e_0, e_1, ...
 
 # First row of an observation's derivatives: by the unknowns of its track, the residual itself, by
-# phi of its frame, by the path, and by the place p(s).
+# phi of its frame, by the path, and by the place p(s); then the factor of all of them.
 _ROWS = first_indices(
     track=TRACK_UNKNOWNS,
     residual=1,
     phi=3,
     path=_UNKNOWNS['end'],
     place=3,
+    factor=1,
 )
 RESIDUAL = _ROWS['residual']  # the residual [px]
 PHI = _ROWS['phi']  # by phi of the frame
 PATH = _ROWS['path']  # by the unknowns of the path
 PLACE = _ROWS['place']  # by the place p(s)
+FACTOR = _ROWS['factor']  # root of the observation's weight over the variance [1/px]
 ROWS = _ROWS['end']  # number of rows
 
 # Place of the first entry of the lens among the deviations.
@@ -250,6 +261,13 @@ class Path(NamedTuple):
     duration: float  # T [s]
 
 
+class Noise(NamedTuple):
+    """What the residuals of an observation may be."""
+
+    variance: float  # of each coordinate [px^2]
+    farthest: float  # largest squared residual of an observation that counts [px^2]
+
+
 @small_kernel
 def _bends(s: float, T: float) -> tuple[float, float, float]:
     """``B_j(s)`` of the polynomials 1, 2 x - 1 and 6 x^2 - 6 x + 1 of ``x = s / T``."""
@@ -288,16 +306,16 @@ def observe(
     R: Array,
     moves: float,
     path: Path,
-    variance: float,
+    noise: Noise,
     rows: Array,
     squares: Array,
 ) -> None:
     """Write residuals and derivatives (ROWS, 2, BLOCK) of a block's observations in one frame.
 
     `o` (VALUES, BLOCK), `track` (TRACK_VALUES, BLOCK): a block of observations and of tracks.
-    R (3, 3): ``Exp(phi_v) R_v``. `moves`: 0 for the first frame, whose phi is zero, else 1.
-    `variance`: of the noise [px^2]. Rows are times the root of the observation's Cauchy weight
-    over the variance; `squares` (BLOCK,) receives the squared residuals [px^2].
+    R (3, 3): ``Exp(phi_v) R_v``. `moves`: 0 for the first frame, whose phi is zero, else 1. Rows
+    are times the root of the observation's weight over the variance of the `noise`: the Cauchy
+    weight, or zero if it is far. `squares` (BLOCK,) receives the squared residuals [px^2].
     """
     k = path.scale
     for i in range(BLOCK):
@@ -314,7 +332,9 @@ def observe(
         off = add(ray, scale(-1.0, column(o, RAY, i)))
         r_u, r_v = dot(column(o, TO_PIXELS, i), off), dot(column(o, TO_PIXELS + 3, i), off)
         squares[i] = r_u * r_u + r_v * r_v
-        root = 1.0 / math.sqrt(variance + 0.25 * squares[i])
+        root = 1.0 / math.sqrt(noise.variance + 0.25 * squares[i])
+        root = root if squares[i] <= noise.farthest else 0.0
+        rows[FACTOR, 0, i] = rows[FACTOR, 1, i] = root
         rows[RESIDUAL, 0, i], rows[RESIDUAL, 1, i] = root * r_u, root * r_v
         for m in range(2):
             to_pixel = column(o, TO_PIXELS + 3 * m, i)
@@ -339,53 +359,80 @@ def observe(
 
 
 class Changes(NamedTuple):
-    """Derivatives of what the tracks' residuals take as given, by all D deviations.
+    """What the tracks' residuals take as given, and what changes it.
 
-    Values of observations that are not used are arbitrary.
+    Derivatives are by the deviations of the configuration, D in all, and then by the errors that
+    each frame has for itself, if they are wanted: of its rate (three axes) and of its stamp. Such
+    an error of the rate turns the rows against the reference row. One of the stamp moves all rows
+    in time, and turns them as far as the rate changes; its effect on the rotations between frames
+    is part of their prior.
     """
 
-    turns: Array  # (V, N, 3, D) of the derotated rays, by a rotation vector on their left [rad]
-    times: Array  # (V, N, D) of s, from the reference row of the first frame [s]
-    rotations: Array  # (V, 3, D) of R_v, by a rotation vector on its left [rad]
-    rows: Array  # (V, N, 3, 3) E_v of the rows
+    rows: RowsOfFrames  # of the N observations in V frames; arbitrary where they are not used
+    turned: TurnedFrames
+    rotations: Array  # (V, 3, D) changes of R_v by the deviations: rotation vectors on its left
     lens: Array  # (V, N, 3, L) of the unit rays in the camera's axes, by the entries of the lens
+    # (V, 3) change of each frame's rate by time [rad/s^2]; (0, 3) without errors of its own
+    rate_changes: Array
 
 
-@small_kernel
+# Number of errors that a frame has for itself: of its rate (three axes), and of its stamp.
+OF_FRAME = 4
+
+
+@inlined_kernel
 def observe_changes(
     o: Array,
     rows: Array,
-    squares: Array,
     path: Path,
-    variance: float,
     changes: Changes,
     place: tuple[int, int],
+    derivatives: Array,
     out: Array,
 ) -> None:
-    """Write derivatives (D, 2, BLOCK) of a block's residuals in one frame by deviations.
+    """Write derivatives (columns, 2, BLOCK) of a block's residuals in one frame by all changes.
 
-    `place`: view and number of the first track of the block. The other arguments are those of
-    `observe`, after it.
+    `place`: view and number of the first track of the block; `derivatives` (D,) is room for those
+    of one residual. The other arguments are those of `observe`, after it.
     """
     v, first = place
     out[:] = 0.0
-    for i in range(min(BLOCK, changes.times.shape[1] - first)):
+    turned = part_of_frame(changes.turned.whole, changes.rows.first_knots, v)
+    at_reference = changes.turned.at_reference[v]
+    rotation, rate = np.empty((3, 3)), np.empty(3)
+    knot = 0
+    for i in range(min(BLOCK, changes.rows.times.shape[1] - first)):
+        if rows[FACTOR, 0, i] == 0.0:  # far
+            continue
+        tau, share = changes.rows.times[v, first + i], changes.rows.shares[v, first + i]
+        knot = knot_before(turned.path.times, tau, knot)
+        write_state(turned.path, tau, knot, rotation, rate)
+        row = RowState(rotation, rate, tau, share, knot)
         bending = _bending(o[TIME, i], path.duration)
         moving = _with_accelerations(column(o, MOVING, i), bending, path)
         velocity = add(scale(1.0 / path.duration, path.t), scale(path.scale, moving))
-        root = 1.0 / math.sqrt(variance + 0.25 * squares[i])
-        turns, delays = changes.turns[v, first + i], changes.times[v, first + i]
         lens = changes.lens[v, first + i]
         for m in range(2):
-            by_ray = scale(root, column(o, TO_PIXELS + 3 * m, i))
+            by_ray = scale(rows[FACTOR, m, i], column(o, TO_PIXELS + 3 * m, i))
             by_turn = cross(by_ray, column(o, RAY, i))
             by_phi = (rows[PHI, m, i], rows[PHI + 1, m, i], rows[PHI + 2, m, i])
             by_place = (rows[PLACE, m, i], rows[PLACE + 1, m, i], rows[PLACE + 2, m, i])
             by_time = dot(by_place, velocity)
-            for d in range(len(out)):
-                of_row = dot(by_turn, column(turns, 0, d))
-                of_frame = dot(by_phi, column(changes.rotations[v], 0, d))
-                out[d, m, i] = of_row + of_frame + by_time * delays[d]
-            by_unrotated = rotated_back(changes.rows[v, first + i], by_ray)
+            derivatives[:] = 0.0
+            add_by_row(derivatives, by_turn, turned, row)
+            add_by_delay(derivatives, by_time, share)
+            for x in range(3):
+                for d in range(len(derivatives)):
+                    of_row = by_turn[x] * at_reference[x, d]
+                    derivatives[d] += by_phi[x] * changes.rotations[v, x, d] - of_row
+            by_unrotated = rotated_back(rotation, by_ray)
             for k in range(lens.shape[1]):
-                out[_FIRST_OF_LENS + k, m, i] -= dot(by_unrotated, column(lens, 0, k))
+                derivatives[_FIRST_OF_LENS + k] -= dot(by_unrotated, column(lens, 0, k))
+            for d in range(len(derivatives)):
+                out[d, m, i] = derivatives[d]
+            if len(changes.rate_changes) > 0:
+                own = len(derivatives) + OF_FRAME * v
+                for x in range(3):
+                    out[own + x, m, i] = tau * by_turn[x]
+                of_rate = tau * dot(by_turn, changes.rate_changes[v])
+                out[own + 3, m, i] = of_rate + by_time

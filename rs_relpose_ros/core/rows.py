@@ -23,12 +23,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_relpose_ros.core.deviations import N_DEVIATIONS, PARTS
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.gyro import GyroPath, knot_before, write_state
 from rs_relpose_ros.geometry.so3 import dot, rotated, rotated_back, Vector
-from rs_relpose_ros.jit import inlined_kernel, kernel
+from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
 # Places of the deviations in the whole vector, as numbers for the kernels.
 _AXES = PARTS['axes'].start
@@ -152,6 +153,30 @@ def add_by_time(
     J[_READOUT] += share * by_time
 
 
+class RowState(NamedTuple):
+    """The camera at one row."""
+
+    rotation: Array  # (3, 3) from its axes to those at the reference
+    rate: Array  # (3,) in its axes [rad/s]
+    time: float  # tau [s]
+    share: float  # of the readout after the middle row
+    knot: int  # of the path, before the row
+
+
+@inlined_kernel
+def add_by_row(J: Array, by_turn: Vector, turned: TurnedPath, row: RowState) -> None:
+    """Add the derivatives of a residual by all deviations that turn its row."""
+    add_by_axes(J, by_turn, row.rotation)
+    add_by_time(J, by_turn, row.rotation, row.rate, row.share, 0.0)
+    add_by_gyro(J, by_turn, turned, row.time, row.knot)
+
+
+@inlined_kernel
+def add_by_delay(J: Array, by_time: float, share: float) -> None:
+    """Add the derivatives of a residual by all deviations that delay its row against others."""
+    J[_READOUT] += share * by_time
+
+
 # -- All rows of a frame --------------------------------------------------------------------------
 
 
@@ -179,7 +204,7 @@ def row_states(path: GyroPath, R_cam_imu: Array, times: Array, shares: Array) ->
         for i in range(3):
             for d in range(N_DEVIATIONS):
                 turns[n, i, d] -= at_reference[i, d]
-        delays[n, _READOUT] = shares[n]
+        add_by_delay(delays[n], 1.0, shares[n])
     return RowStates(rotations, turns, delays)
 
 
@@ -188,11 +213,61 @@ def _write_turns(
     turned: TurnedPath, time: float, share: float, rotation: Array, turns: Array
 ) -> None:
     """Write the rotation at one time and add its turns (3, D) by all deviations."""
-    rate, axes = np.empty(3), np.eye(3)
+    rate = np.empty(3)
+    axes = np.eye(3)
     k = knot_before(turned.path.times, time, 0)
     write_state(turned.path, time, k, rotation, rate)
     for i in range(3):
         axis = (axes[i, 0], axes[i, 1], axes[i, 2])
-        add_by_axes(turns[i], axis, rotation)
-        add_by_time(turns[i], axis, rotation, rate, share, 0.0)
-        add_by_gyro(turns[i], axis, turned, time, k)
+        add_by_row(turns[i], axis, turned, RowState(rotation, rate, time, share, k))
+
+
+# -- Rows of several frames -----------------------------------------------------------------------
+
+
+class RowsOfFrames(NamedTuple):
+    """N rows in each of V frames, with the paths of the frames one after the other."""
+
+    path: GyroPath  # in camera axes, each part relative to the reference row of its frame
+    first_knots: NDArray[np.int64]  # (V + 1,) of the parts
+    times: Array  # (V, N) tau of the rows [s]
+    shares: Array  # (V, N) of the readout after the middle row
+
+
+class TurnedFrames(NamedTuple):
+    """How deviations of the gyro's rates turn the paths of V frames."""
+
+    whole: TurnedPath  # the parts one after the other, each relative to its first knot
+    at_reference: Array  # (V, 3, D) turn of each frame's reference row by all deviations
+
+
+@kernel
+def turned_frames(rows: RowsOfFrames, R_cam_imu: Array) -> TurnedFrames:
+    """Integrate the turns of all frames."""
+    frames = len(rows.times)
+    turns = np.empty((len(rows.path.times), 3, _N_GYRO))
+    turn_rates = np.empty((len(rows.path.times), 3, _N_GYRO))
+    whole = TurnedPath(rows.path, turns, turn_rates)
+    at_reference = np.zeros((frames, 3, N_DEVIATIONS))
+    for v in range(frames):
+        part = part_of_frame(whole, rows.first_knots, v)
+        turned = turned_path(part.path, R_cam_imu, np.zeros(part.path.rates.shape))
+        part.turns[:] = turned.turns
+        part.turn_rates[:] = turned.turn_rates
+        _write_turns(turned, 0.0, 0.0, np.empty((3, 3)), at_reference[v])
+    return TurnedFrames(whole, at_reference)
+
+
+@small_kernel
+def part_of_frame(whole: TurnedPath, first_knots: NDArray[np.int64], v: int) -> TurnedPath:
+    """The turned path of frame v."""
+    begin, end = first_knots[v], first_knots[v + 1]
+    return TurnedPath(
+        GyroPath(
+            whole.path.times[begin:end],
+            whole.path.rates[begin:end],
+            whole.path.rotations[begin:end],
+        ),
+        whole.turns[begin:end],
+        whole.turn_rates[begin:end],
+    )

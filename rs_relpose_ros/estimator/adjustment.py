@@ -1,8 +1,8 @@
 """Adjustment of the tracks in all frames of a pair: path of the camera, priors, covariance.
 
 The model and its unknowns are those of `core.reprojection`. An observation has the robust cost
-``4 log(1 + r^2 / 4)``, r being its residual in units of the noise. The unknowns of the tracks are
-eliminated (Schur complement).
+``4 log(1 + r^2 / 4)``, r being its residual in units of the noise; beyond `_FARTHEST`, the cost is
+constant. The unknowns of the tracks are eliminated (Schur complement).
 
 Products of blocks are by BLAS; blocks are too small for threads.
 """
@@ -27,12 +27,13 @@ from rs_relpose_ros.core.reprojection import (
     BLOCK,
     Changes,
     COLUMNS,
-    Flags,
     INVERSE_DISTANCE,
     LOG_SCALE,
     MOST_ACCELERATIONS,
+    Noise,
     observe,
     observe_changes,
+    OF_FRAME,
     PATH,
     Path,
     PHI,
@@ -59,23 +60,25 @@ INVERSE_DISTANCE_SIGMA = 10.0
 # [chosen: far below the weight of one observation, any value in 1e-12..1e-6 would do]
 _FLOOR = 1e-9
 # Largest number of steps. More of them cost time where the fit does not converge.
-# [chosen: most pairs need three]
-_STEPS = 6
-# Decrease of the cost (chi-square) below which the fit ends: half a unit of chi-square moves no
-# unknown by a sigma. [chosen: any value in 0.1..1 would do]
+# [chosen: most pairs need three, a start far from the optimum up to eight]
+_STEPS = 12
+# Expected decrease of the cost (chi-square) below which a step is the last one: half a unit of
+# chi-square moves no unknown by a sigma. [chosen: any value in 0.1..1 would do]
 CONVERGED = 0.5
-# The same of a fit that only shows which observations are far from the others. A smaller value
-# takes more steps for the same observations; a larger one leaves good ones far.
+# The same from which on far observations do not count. A smaller value takes more steps for the
+# same observations; with a larger one, good ones are far while the path still bends.
 # [chosen: a hundredth of the degrees of freedom, any value in 5..30 would do]
-NEARLY_CONVERGED = 20.0
+_NEARLY_CONVERGED = 20.0
 # Largest step of log k. A longer one leaves the range in which the path is linear in it.
 # [chosen: a factor of e in the baseline]
 _LARGEST_STEP = 1.0
 # Damping of the first step, as a share of the diagonal: nearly a Gauss-Newton step, since the
 # two-view estimate is a good start. [chosen: any value in 1e-9..1e-4 would do]
 _FIRST_DAMPING = 1e-7
-# Distance from its prediction [sigma] beyond which an observation is far, and is left out of the
-# second fit. [chosen: one good observation in 3000 is farther, in two coordinates]
+# Distance from its prediction [sigma] beyond which an observation is far, and does not count. A
+# smaller limit would leave out good observations, a larger one lets tracks that have jumped pull
+# the path.
+# [chosen: one good observation in 3000 is farther, in two coordinates]
 _FARTHEST = 4.0
 # Error of a track that its residuals do not show, since it is similar in all frames [px]. Without
 # it, the covariance of many tracks would be too small.
@@ -110,6 +113,7 @@ class PathState(NamedTuple):
 class Normal(NamedTuple):
     """Normal equations of the path's n unknowns, the tracks eliminated."""
 
+    state: PathState  # about which they are
     of_priors: float  # cost of the priors
     hessian: Array  # (n, n)
     gradient: Array  # (n,)
@@ -119,7 +123,7 @@ class Normal(NamedTuple):
     factors: Array  # (blocks, 3, 3, BLOCK) Cholesky factors of the tracks' own equations
     scatter: Array  # (n, n) of the tracks' parts of the gradient
     squares: Array  # (V, blocks, BLOCK) of the residuals [px^2]
-    noise: float  # of the observations, with the error that residuals do not show [px]
+    noise: Noise  # of the observations, with the error that residuals do not show
 
 
 class Adjusted(NamedTuple):
@@ -128,8 +132,7 @@ class Adjusted(NamedTuple):
     state: PathState
     sigma: float
     covariance: Array
-    far: Flags  # (V, blocks, BLOCK) observations far from their predictions
-    normal: Normal  # equations about the state
+    normal: Normal  # equations about the state before the last step
 
 
 @small_kernel
@@ -251,8 +254,8 @@ def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: 
 
 
 @kernel
-def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma: float) -> Normal:
-    """Normal equations about a state, with the noise `sigma` [px]."""
+def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, noise: Noise) -> Normal:
+    """Normal equations about a state."""
     V, blocks, _ = tracks.used.shape
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
     n = path_unknowns + 3 * (V - 1)
@@ -275,7 +278,7 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma:
                 rotations[v],
                 float(min(v, 1)),
                 path,
-                sigma * sigma,
+                noise,
                 rows,
                 squares[v, b],
             )
@@ -289,23 +292,24 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, sigma:
         scatter += product
     hessian, gradient = whole[:n, :n].copy(), whole[n, :n].copy()
     of_priors = _add_priors(state, priors, hessian, gradient)
-    return Normal(of_priors, hessian, gradient, solved, factors, scatter, squares, sigma)
+    return Normal(state, of_priors, hessian, gradient, solved, factors, scatter, squares, noise)
 
 
 @kernel
-def path_by_deviations(
-    tracks: TrackBlocks, state: PathState, normal: Normal, changes: Changes
-) -> Array:
-    """Derivative (n, D) of the optimum's path by deviations of what the residuals take as given.
+def path_by_deviations(tracks: TrackBlocks, normal: Normal, changes: Changes) -> Array:
+    """Derivative (n, columns) of the optimum's path by `changes` of what residuals take as given.
 
-    `normal` are the equations about the optimum `state`.
+    `normal` are the equations about the optimum, or near it. The columns are the D deviations,
+    then the errors of each frame.
 
     ``-H^-1 C``, with the Hessian H of the path and its products C with the deviations, the tracks
     eliminated from both.
     """
+    state = normal.state
     V, blocks, _ = tracks.used.shape
-    n, D = len(normal.gradient), changes.rotations.shape[2]
-    variance = normal.noise * normal.noise
+    n, deviations = len(normal.gradient), changes.rotations.shape[2]
+    D = deviations + OF_FRAME * len(changes.rate_changes)
+    derivatives = np.empty(deviations)
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
     path, rotations = _path(state, tracks.duration), _turned(tracks, state)
     used_rows = PATH - RESIDUAL + path_unknowns
@@ -322,9 +326,9 @@ def path_by_deviations(
         for v in range(V):
             o = tracks.observations[v, b]
             moves = float(min(v, 1))
-            observe(o, state.tracks[b], rotations[v], moves, path, variance, rows, squares)
+            observe(o, state.tracks[b], rotations[v], moves, path, normal.noise, rows, squares)
             place = (v, b * BLOCK)
-            observe_changes(o, rows, squares, path, variance, changes, place, columns)
+            observe_changes(o, rows, path, changes, place, derivatives, columns)
             places = _places(v, path_unknowns, n)
             np.dot(used, columns.reshape(D, 2 * BLOCK).T, products)
             for d in range(D):
@@ -341,13 +345,21 @@ def path_by_deviations(
 
 
 @kernel
-def _cost(normal: Normal, tracks: TrackBlocks, sigma: float) -> tuple[float, float]:
-    """Cost with the noise `sigma` [px], and the noise by these residuals, once iterated."""
-    cost, weighted, count = normal.of_priors, 0.0, 0
-    used, squares = tracks.used.ravel(), normal.squares.ravel()
+def _cost(
+    normal: Normal, tracks: TrackBlocks, sigma: float, farthest: float
+) -> tuple[float, float]:
+    """Cost with the noise `sigma` [px], and the noise by these residuals, once iterated.
+
+    Squared residuals beyond `farthest` [px^2] count as those there.
+    """
+    cost = normal.of_priors
+    weighted = 0.0
+    count = 0
+    used = tracks.used.ravel()
+    squares = normal.squares.ravel()
     for i in range(len(used)):
         if used[i]:
-            q = 0.25 * squares[i] / (sigma * sigma)
+            q = 0.25 * min(squares[i], farthest) / (sigma * sigma)
             cost += 4.0 * cauchy_cost(q)
             weighted += 4.0 * q * cauchy_weight(q)
             count += 1
@@ -396,11 +408,14 @@ def moved_state(state: PathState, normal: Normal, step: Array) -> PathState:
 
 
 @small_kernel
-def _step(normal: Normal, damping: float) -> Array:
-    """Step (n,) of the path; zero if the equations are singular."""
-    step, _ = damped_step(normal.hessian, normal.gradient, damping)
+def _step(normal: Normal, damping: float) -> tuple[Array, float]:
+    """Step (n,) of the path, and the decrease of the cost that it lets expect.
+
+    Zero and a negative number if the equations are singular.
+    """
+    step, expected_gain = damped_step(normal.hessian, normal.gradient, damping)
     step[LOG_SCALE] = min(max(step[LOG_SCALE], -_LARGEST_STEP), _LARGEST_STEP)
-    return step
+    return step, expected_gain
 
 
 @kernel
@@ -412,38 +427,41 @@ def adjust(
     weight: float,
     converged: float,
 ) -> Adjusted:
-    """Levenberg-Marquardt over path and tracks, the noise estimated again after each step.
+    """Levenberg-Marquardt over path and tracks, the noise estimated again before each step.
 
-    `expected` [px]: noise, which counts as much as `weight` degrees of freedom. Steps end with
-    one that decreases the cost (chi-square) by less than `converged`.
+    `expected` [px]: noise, which counts as much as `weight` degrees of freedom. The last step is
+    the one that is expected to decrease the cost (chi-square) by less than `converged`; the
+    equations about the state before it give the covariance.
     """
     observations = 2.0 * tracks.used.sum()
     state, sigma, noise, damping = start, expected, expected, _FIRST_DAMPING
-    normal = linearised(tracks, priors, state, sigma)
+    normal = linearised(tracks, priors, state, Noise(sigma * sigma, math.inf))
     freedom = max(observations - TRACK_UNKNOWNS * tracks.number - len(normal.gradient), 1.0)
     for _ in range(_STEPS):
         # Residuals of fewer degrees of freedom than observations, weighted as in the cost.
-        variance = sigma * sigma * _cost(normal, tracks, sigma)[1] / _GAUSSIAN
+        before = normal.noise.farthest
+        variance = sigma * sigma * _cost(normal, tracks, sigma, before)[1] / _GAUSSIAN
         noise = math.sqrt(
             (weight * expected * expected + observations * variance) / (weight + freedom)
         )
         sigma = math.hypot(noise, COMMON_SIGMA)
-        after = moved_state(state, normal, _step(normal, damping))
-        new = linearised(tracks, priors, after, sigma)
-        gain = _cost(normal, tracks, sigma)[0] - _cost(new, tracks, sigma)[0]
-        if gain > 0.0:  # False for NaN
+        step, expected_gain = _step(normal, damping)
+        after = moved_state(state, normal, step)
+        if before < math.inf and 0.0 <= expected_gain < converged:
+            state = after
+            break
+        farthest = math.inf
+        if before < math.inf or 0.0 <= expected_gain < _NEARLY_CONVERGED:
+            farthest = (_FARTHEST * sigma) ** 2
+        new = linearised(tracks, priors, after, Noise(sigma * sigma, farthest))
+        cost = _cost(normal, tracks, sigma, before)[0]
+        if _cost(new, tracks, sigma, before)[0] < cost:  # False for NaN
             state, normal, damping = after, new, 0.1 * damping
-            if gain < converged:
-                break
         else:
             damping = max(100.0 * damping, 1e-4)
-    return Adjusted(
-        state,
-        noise,
-        _covariance(normal, state, priors, (sigma / noise) ** 2, tracks.number),
-        normal.squares > (_FARTHEST * sigma) ** 2,
-        normal,
-    )
+    common = (sigma / noise) ** 2
+    covariance = _covariance(normal, state, priors, common, tracks.number)
+    return Adjusted(state, noise, covariance, normal)
 
 
 @small_kernel

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import MOTIONS
-from rs_relpose_ros.core.deviations import LIVE
+from rs_relpose_ros.core.deviations import LIVE, N_DEVIATIONS
 from rs_relpose_ros.core.reprojection import (
     ACCELERATION,
     BIAS,
@@ -28,11 +28,9 @@ from rs_relpose_ros.core.reprojection import (
     MOST_ACCELERATIONS,
     start_of_tracks,
     TANGENT,
-    TIME,
-    TO_PIXELS,
     TrackBlocks,
 )
-from rs_relpose_ros.core.rows import row_states
+from rs_relpose_ros.core.rows import row_states, RowsOfFrames, turned_frames
 from rs_relpose_ros.estimator import adjustment
 from rs_relpose_ros.estimator.adjustment import Adjusted, PathPriors, PathState
 from rs_relpose_ros.estimator.pair_problem import PairProblem
@@ -109,13 +107,7 @@ def refined(
             f'other: {adjusted.sigma:.1f} px',
         )
     pose = _result(pose, adjusted, path, tracks, priors)
-    if path.rate_doubt or config.stamp_sigma > _JITTER:
-        of_frames = _covariance_of_frames(adjusted, path, tracks, observed)
-        pose = replace(pose, covariance=pose.covariance + of_frames)
-    changes = _changes(path, observed)
-    if changes is None:
-        return pose
-    return replace(pose, by_deviation=_pose_by_deviation(adjusted, path, tracks, changes))
+    return _with_changes(pose, adjusted, path, tracks, observed)
 
 
 def _adjusted(
@@ -125,37 +117,45 @@ def _adjusted(
     tracks: TrackBlocks,
     priors: PathPriors,
 ) -> Adjusted:
-    """The adjusted path; observations far from a first result are removed from `tracks`."""
+    """The adjusted path, with the noise of two views as the expected one."""
     sigma = path.config.pixel_sigma
     expected = min(max(pose.diagnostics.residual_rms, _LEAST_NOISE * sigma), sigma)
-    nearly = adjustment.adjust(
-        tracks,
-        priors,
-        start,
-        expected,
-        _SIGMA_FREEDOM,
-        adjustment.NEARLY_CONVERGED,
-    )
-    tracks.used[nearly.far] = False
-    tracks.observations.swapaxes(2, 3)[nearly.far, TO_PIXELS:TIME] = 0.0
     return adjustment.adjust(
         tracks,
         priors,
-        nearly.state,
+        start,
         expected,
         _SIGMA_FREEDOM,
         adjustment.CONVERGED,
     )
 
 
-def _pose_by_deviation(
-    adjusted: Adjusted, path: PairProblem, tracks: TrackBlocks, changes: Changes
-) -> Array:
-    """Derivative (6, K) of the pose from all frames by the deviations of `LIVE`."""
-    moved = adjustment.path_by_deviations(tracks, adjusted.state, adjusted.normal, changes)
-    by_deviation = _pose_by_path(adjusted, tracks) @ moved
-    by_deviation[3:] += changes.rotations[-1]
-    return np.asarray(by_deviation @ LIVE.of_camera(path.camera))
+def _with_changes(
+    pose: RelativePose,
+    adjusted: Adjusted,
+    path: PairProblem,
+    tracks: TrackBlocks,
+    observed: _Observed,
+) -> RelativePose:
+    """The pose with its derivative by the deviations, and with the doubt of each frame's rows."""
+    knows_gyro = path.gyro is not None and path.R_cam_imu is not None
+    doubts_frames = path.rate_doubt > 0.0 or path.config.stamp_sigma > _JITTER
+    if not knows_gyro and not doubts_frames:
+        return pose
+    changes = _changes(path, observed, doubts_frames)
+    moved = adjustment.path_by_deviations(tracks, adjusted.normal, changes)
+    pose_moved = _pose_by_path(adjusted, tracks) @ moved
+    by_frame = pose_moved[:, N_DEVIATIONS:]
+    pose_moved[3:, :N_DEVIATIONS] += changes.rotations[-1]
+    if doubts_frames:
+        of_rate, of_stamp = path.rate_doubt**2, path.config.stamp_sigma**2
+        variances = np.tile([of_rate, of_rate, of_rate, of_stamp], len(path.motions))
+        of_frames = by_frame * variances @ by_frame.T
+        pose = replace(pose, covariance=pose.covariance + of_frames)
+    if knows_gyro:
+        by_deviation = pose_moved[:, :N_DEVIATIONS] @ LIVE.of_camera(path.camera)
+        pose = replace(pose, by_deviation=by_deviation)
+    return pose
 
 
 def _with_inliers(
@@ -472,68 +472,39 @@ def _velocities(
 # it, and the time offset of a selection is the one of the stamped row, as the parameter.
 
 
-def _changes(path: PairProblem, observed: _Observed) -> Changes | None:
-    """Changes of rays, times and rotations by deviations; None without the gyro of the pair."""
-    if path.gyro is None or path.R_cam_imu is None:
-        return None
-    camera = path.camera
-    shares = (observed.rows - camera.reference_row_index) / camera.row_count
-    frames = [
-        row_states(_path_of_rows(motion), path.R_cam_imu, observed.times[view], shares[view])
-        for view, motion in enumerate(path.motions)
-    ]
-    at_stamps = np.zeros(len(path.seconds))
-    between = row_states(path.gyro, path.R_cam_imu, path.seconds, at_stamps)
-    return Changes(
-        np.stack([states.by_deviation for states in frames]),
-        np.stack([states.time_by_deviation for states in frames]),
-        between.by_deviation,
-        np.stack([states.rotation for states in frames]),
-        observed.by_lens,
-    )
+def _changes(path: PairProblem, observed: _Observed, doubts_frames: bool) -> Changes:
+    """What deviations change, and with `doubts_frames` the errors that each frame has for itself.
 
-
-# Errors of a frame's own: of its rate (three axes), and of its stamp.
-_OF_FRAME = 4
-
-
-def _covariance_of_frames(
-    adjusted: Adjusted, path: PairProblem, tracks: TrackBlocks, observed: _Observed
-) -> Array:
-    """Covariance (6, 6) of the pose by the errors of rate and stamp of each frame for itself."""
-    changes = _changes_by_frames(path, observed)
-    moved = adjustment.path_by_deviations(tracks, adjusted.state, adjusted.normal, changes)
-    by_frame = _pose_by_path(adjusted, tracks) @ moved
-    of_rate, of_stamp = path.rate_doubt**2, path.config.stamp_sigma**2
-    variances = np.tile([of_rate, of_rate, of_rate, of_stamp], len(path.motions))
-    return np.asarray(by_frame * variances @ by_frame.T)
-
-
-def _changes_by_frames(path: PairProblem, observed: _Observed) -> Changes:
-    """Changes of turns and times by the errors that each of V frames has for itself, 4 V in all.
-
-    An error of the rate turns the rows against the stamped one. An error of the stamp moves all
-    rows in time, and turns them as far as the rate changes; its effect on the rotations between
-    frames is part of their prior.
+    Without the gyro of the pair the changes of the rotations between frames are zero.
     """
-    views, count = observed.times.shape
-    turns = np.zeros((views, count, 3, _OF_FRAME * views))
-    times = np.zeros((views, count, _OF_FRAME * views))
-    for view, motion in enumerate(path.motions):
-        rows = _path_of_rows(motion)
-        lasted = max(float(rows.times[-1] - rows.times[0]), _LEAST_SPAN)
-        change = (rows.rates[-1] - rows.rates[0]) / lasted
-        own = _OF_FRAME * view
-        rates = np.column_stack([np.eye(3), change])
-        turns[view, :, :, own : own + _OF_FRAME] = observed.times[view, :, None, None] * rates
-        times[view, :, own + _OF_FRAME - 1] = 1.0
-    return Changes(
-        turns,
-        times,
-        np.zeros((views, 3, _OF_FRAME * views)),
-        np.zeros((views, count, 3, 3)),
-        np.zeros((views, count, 3, 0)),  # no deviation of the lens
+    camera = path.camera
+    parts = [_path_of_rows(motion) for motion in path.motions]
+    rows = RowsOfFrames(
+        GyroPath(*(np.concatenate(values) for values in zip(*parts, strict=True))),
+        np.cumsum([0, *(len(part.times) for part in parts)]),
+        observed.times,
+        (observed.rows - camera.reference_row_index) / camera.row_count,
     )
+    rate_changes = [_change_of_rate(part) for part in parts] if doubts_frames else []
+    R_cam_imu = np.eye(3) if path.R_cam_imu is None else path.R_cam_imu
+    if path.gyro is None:
+        rotations = np.zeros((len(parts), 3, N_DEVIATIONS))
+    else:
+        at_stamps = np.zeros(len(path.seconds))
+        rotations = row_states(path.gyro, R_cam_imu, path.seconds, at_stamps).by_deviation
+    return Changes(
+        rows,
+        turned_frames(rows, R_cam_imu),
+        rotations,
+        observed.by_lens,
+        np.array(rate_changes).reshape(-1, 3),
+    )
+
+
+def _change_of_rate(rows: GyroPath) -> Array:
+    """Change (3,) of the rate by time within a frame [rad/s^2]."""
+    lasted = max(float(rows.times[-1] - rows.times[0]), _LEAST_SPAN)
+    return np.asarray((rows.rates[-1] - rows.rates[0]) / lasted)
 
 
 def _path_of_rows(motion: FrameMotion) -> GyroPath:
