@@ -32,7 +32,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 .PHONY: demo test test-all lint docs clean distclean same-python
 
 demo: $(stamp)
-	$(bin)/python demo/run_demo.py
+	@$(bin)/python demo/run_demo.py
 
 # One thread of OpenBLAS, as nodes and commands have: with more, results differ in the last bits
 # (NumPy 1.26). Message types are checked in tests; in Jazzy that is off unless asked for. Three
@@ -74,9 +74,11 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
 	@echo 'Setting up $(VENV): a minute or two and 0.7 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
-	grep -v -e '^#' -e '^ros-' requirements/base.txt | \
+	@echo '[1/3] NumPy, SciPy, OpenCV, Numba ...'
+	@grep -v -e '^#' -e '^ros-' requirements/base.txt | \
 	    xargs $(pip) install --no-compile $(CONSTRAINTS:%=-c %)
-	$(bin)/python -m rs_relpose_ros.pipeline.warm_up & kernels=$$!; \
+	@echo '[2/3] ROS 2 and GTSAM; meanwhile the kernels are compiled ...'
+	@$(bin)/python -m rs_relpose_ros.pipeline.warm_up & kernels=$$!; \
 	$(pip) install --no-compile -r requirements/demo.txt $(CONSTRAINTS:%=-c %) && \
 	find $(VENV)/lib -type d '(' -name tests -o -name gtsam_unstable -o -path '*/gtsam/Data' ')' \
 	    -prune -exec rm -rf {} + && \
@@ -92,18 +94,19 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 	done && \
 	$(bin)/python -c 'import $(first_run)'; \
 	installed=$$?; wait $$kernels; exit $$installed
-	$(pip) install --no-deps --no-build-isolation --editable . --editable ./rs_relpose_lab
-	find $(packages)/pip -name __pycache__ -prune -exec rm -rf {} +
-	touch $@
+	@echo '[3/3] this package and the kernels that are left ...'
+	@$(pip) install --no-deps --no-build-isolation --editable . --editable ./rs_relpose_lab
+	@find $(packages)/pip -name __pycache__ -prune -exec rm -rf {} +
+	@touch $@
 
 $(test_stamp): $(stamp) requirements/test.txt
 	@echo 'Adding what tests and linters need: half a minute and 0.2 GB.'
-	$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
-	touch $@
+	@$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
+	@touch $@
 
 $(docs_stamp): $(stamp) requirements/docs.txt
-	$(pip) install --no-compile -r requirements/docs.txt $(CONSTRAINTS:%=-c %)
-	touch $@
+	@$(pip) install --no-compile -r requirements/docs.txt $(CONSTRAINTS:%=-c %)
+	@touch $@
 
 # A PYTHON that was asked for must be the one that an existing environment was made with.
 version := -c 'import sys; print(*sys.version_info[:2], sep=".")'

@@ -421,7 +421,7 @@ def test_landmarks_are_gated(rows):
 def test_ncore_without_its_package(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'ncore', None)
     assert run('--format', 'ncore')[0] == 2
-    assert "pip install 'rs_relpose_ros[ncore]'" in capsys.readouterr().err
+    assert "pip install 'nvidia-ncore>=19.8'" in capsys.readouterr().err
 
 
 def test_a_damaged_table_of_tracks(tmp_path):

@@ -382,6 +382,27 @@ def test_bad_usage(arguments, capsys):
     assert 'rs_relpose: error: ' in capsys.readouterr().err
 
 
+def test_a_command_line_without_words_lists_the_commands(capsys):
+    assert command_line.main([]) == 2
+    shown = capsys.readouterr().err
+    assert 'estimate relative poses from a bag' in shown
+    assert shown.endswith('rs_relpose: error: give one of these commands\n')
+
+
+def test_a_node_without_ros_says_what_to_do():
+    code = """
+import importlib.util as util
+found = util.find_spec
+util.find_spec = lambda name, *of: None if name == 'rclpy' else found(name, *of)
+from rs_relpose_ros.nodes.start import relpose_node
+relpose_node()
+"""
+    ended = run(sys.executable, '-c', code)
+    assert ended.returncode == 2 and ended.stdout == ''
+    assert ended.stderr.startswith('relpose_node: error: this Python finds no ROS 2 (rclpy)')
+    assert ended.stderr.count('\n') == 1
+
+
 @pytest.fixture
 def as_replay(monkeypatch):
     """Makes a function the work of the command."""
@@ -426,6 +447,11 @@ def test_command_gets_its_arguments_and_gives_the_exit_code(words, code, as_repl
             OSError(28, 'No space left on device'),
             1,
             'rs_relpose: error: [Errno 28] No space left on device\n',
+        ),
+        (
+            OSError(28, 'No space left on device', 'out/errors.csv'),
+            1,
+            'rs_relpose: error: out/errors.csv: No space left on device\n',
         ),
         (KeyboardInterrupt(), 130, 'rs_relpose: interrupted\n'),
     ],

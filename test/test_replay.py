@@ -472,6 +472,7 @@ def test_parameter_file_and_assignments(tmp_path):
         ('other:\n  ros__parameters:\n    a: 1\n', 'has no parameters of relpose_node'),
         ('just text', 'is not a ROS parameter file'),
         ('a: ' + '[' * 500 + ']' * 500, 'is not valid YAML'),
+        ('a: [1,\n2', 'is not valid YAML: line 2, column 2: expected'),
         ('a: &a [1]\n/**: {ros__parameters: {gyro_bias: *a}}', 'YAML aliases'),
     ],
 )

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from html.parser import HTMLParser
+import math
 from pathlib import Path
 import re
 import shutil
@@ -15,7 +16,7 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import main as command_line
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.report.page import page
+from rs_relpose_ros.report.page import lines_without_pose, page, with_sigma
 from rs_relpose_ros.report.plots import thinned
 from rs_relpose_ros.report.residuals import epipolar_residuals, map_of, rates_compared
 from rs_relpose_ros.report.run import is_unusable, nothing_of, Observation, observe
@@ -164,6 +165,25 @@ def test_names_of_a_recording_are_texts():
     text = page(nothing_of(Path('x.mcap'), Parameters(), '<script>alert(1)</script>'), '1')
     assert 'script' not in Elements(text).tags
     assert '&lt;script&gt;' in text
+
+
+@pytest.mark.parametrize(
+    ('values', 'sigma', 'scale', 'shown'),
+    [
+        ((0.2971,), 8.3e-4, 1e3, '0.30 &plusmn; 0.83'),
+        ((450.21, 449.8), 1.74, 1.0, '450.2, 449.8 &plusmn; 1.7'),
+        ((1234.0,), 120.0, 1.0, '1234 &plusmn; 120'),
+        ((0.123456,), None, 1.0, '0.1235'),
+        ((0.123456,), math.inf, 1.0, '0.1235 &plusmn; inf'),
+    ],
+)
+def test_values_have_the_decimals_of_their_sigma(values, sigma, scale, shown):
+    assert with_sigma(values, sigma, scale) == shown
+
+
+def test_pairs_without_a_pose_are_counted_by_status(observation):
+    (line,) = lines_without_pose(observation)
+    assert line.startswith('PURE_ROTATION (3), such as: a rotation alone leaves 0.0')
 
 
 def test_a_damaged_bag_has_a_page_that_says_so(damaged, tmp_path, capsys):

@@ -109,7 +109,7 @@ def _damage(path: Path, file: Path, error: Exception) -> InputError:
     }
     remedy = remedies.get(file.suffix, 'copy it again')
     if isinstance(error, NoBeginError):
-        remedy = 'copy it again, as no tool recovers a bag without its begin'
+        remedy = 'copy it again, as no tool recovers a bag whose beginning is lost'
     return InputError(f'{path} {kind}: {reason}; {remedy}')
 
 
@@ -254,7 +254,9 @@ def _open(file: Path, path: Path, stack: ExitStack) -> Storage:
         return SqliteStorage(file, stack)
     if source is Source.ROS1:
         return Ros1Storage(file, stack)
-    raise NoBeginError('it begins as no bag does')
+    if file.stat().st_size == 0:
+        raise NoBeginError('it is empty')
+    raise NoBeginError('its first bytes are not those of a bag')
 
 
 def _source(file: Path, path: Path) -> Source | None:

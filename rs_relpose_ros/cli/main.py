@@ -77,8 +77,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 # What a command of the laboratory lacks where only this package is installed.
 LABORATORY = (
-    'the package rs_relpose_lab, which is not installed: '
-    '"pip install \'rs_relpose_ros[lab]\'", or in a checkout "pip install ./rs_relpose_lab"'
+    'the package rs_relpose_lab, which is not installed: in the checkout of this version, '
+    '"pip install ./rs_relpose_lab"'
 )
 # Exit codes besides 0, which scripts of users rely on. [derived: interface of the commands]
 FAILED = 1  # the work ran, and failed
@@ -190,6 +190,9 @@ def _run(arguments: list[str]) -> int:
     selected = next((word for word in arguments if not word.startswith('-')), None)
     try:
         parser = make_parser(selected)
+        if not arguments:
+            parser.print_help(sys.stderr)
+            return _report_error('error: give one of these commands', BAD_INPUT)
         if selected is not None and selected in COMMANDS:
             arguments = with_optional_values(arguments, load_command(selected))
         args = parser.parse_args(arguments)
@@ -211,7 +214,9 @@ def _run(arguments: list[str]) -> int:
         _logger.debug('raised here', exc_info=True)
         if isinstance(error, _BAD_PATHS):
             return _report_error(f'error: {error.filename}: {error.strerror}', BAD_INPUT)
-        # Another OSError, such as a full disk: the input was fine.
+        if isinstance(error, OSError) and error.filename is not None:
+            # Another one, such as a full disk: the input was fine.
+            return _report_error(f'error: {error.filename}: {error.strerror}', FAILED)
         return _report_error(
             f'error: {error}', FAILED if isinstance(error, OSError) else BAD_INPUT
         )

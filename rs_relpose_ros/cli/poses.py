@@ -257,7 +257,7 @@ def _odometry_of(args: argparse.Namespace, **how: Any) -> tuple[Path, Any]:
 
 def _odometry(args: argparse.Namespace) -> int:
     folder, outcome = _odometry_of(args, rate=args.rate, loops=args.loops)
-    from rs_relpose_ros.odometry import offline, rows
+    from rs_relpose_ros.odometry import map_points, offline, rows
 
     metrics = outcome.metrics
     pairs = metrics['pairs']
@@ -289,8 +289,8 @@ def _odometry(args: argparse.Namespace) -> int:
         print(f'no smoothed path: {outcome.unsolved} of its graphs could not be solved')
         return FAILED
     print(
-        f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
-        f'{offline.PICTURE}, {SUMMARY_FILE}'
+        f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {offline.STATES_FILE}, '
+        f'{rows.ROWS_FILE}, {map_points.TRACKS_FILE}, {offline.PICTURE}, {SUMMARY_FILE}'
     )
     return 0
 
@@ -382,10 +382,10 @@ def _print_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
         )
         print(f'points in the images, at the poses of their rows: {reprojection}')
         print(f'{args.format} has {FORMATS[args.format].poses}: off that by {formula}')
-    options.warn_unused(
-        dict(Counter(one['reason'] for one in report['left_out']).most_common()),
-        f'left out (stamps in {export.REPORT_FILE})',
-    )
+    for reason, count in Counter(one['reason'] for one in report['left_out']).most_common():
+        _logger.warning(
+            '%d images are left out (stamps in %s): %s', count, export.REPORT_FILE, reason
+        )
     for begin_ns, end_ns in report['trajectory_gaps_ns']:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 

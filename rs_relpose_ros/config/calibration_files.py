@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+import yaml
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
@@ -69,6 +70,14 @@ def plain_yaml(text: str) -> str:
     text = text.removeprefix('\ufeff')
     text = re.sub(r'\A%YAML:[^\n]*\n(?:---[^\n]*\n)?', '', text)
     return text.replace('!!opencv-matrix', '')
+
+
+def yaml_problem(error: Exception) -> str:
+    """Say in one line why a text is no YAML, and where."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        mark = error.problem_mark
+        return f'line {mark.line + 1}, column {mark.column + 1}: {error.problem}'
+    return ' '.join(str(error).split())
 
 
 def calibration_of(document: Any, path: str) -> ToolCalibration | None:

@@ -19,7 +19,12 @@ from typing import Any
 
 import yaml
 
-from rs_relpose_ros.config.calibration_files import calibration_of, plain_yaml, ToolCalibration
+from rs_relpose_ros.config.calibration_files import (
+    calibration_of,
+    plain_yaml,
+    ToolCalibration,
+    yaml_problem,
+)
 from rs_relpose_ros.config.settings import ANY_VALUE, Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.output_files import written
@@ -139,7 +144,10 @@ def _text_of(path: Path) -> str:
     try:
         return path.read_text(encoding='utf-8')
     except UnicodeDecodeError as error:
-        raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
+        raise InputError(
+            f'{path} is not a parameter file: it is not text in UTF-8 ({error.reason} at byte '
+            f'{error.start})'
+        ) from error
 
 
 def read_calibration(path: Path) -> ToolCalibration:
@@ -161,7 +169,7 @@ def _document(text: str, path: str) -> Any:
             raise InputError(f'{path} has YAML aliases, which are not supported')
         return yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
+        raise InputError(f'{path} is not valid YAML: {yaml_problem(error)}') from error
 
 
 def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:

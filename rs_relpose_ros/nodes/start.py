@@ -8,6 +8,7 @@ the main thread destroys the node, which has crashed the process.
 from collections.abc import Callable
 from functools import partial
 import importlib
+import importlib.util
 import os
 import signal
 import sys
@@ -20,11 +21,20 @@ from rs_relpose_ros.garbage import collect_seldom
 # Signals that end a node. [derived: ros2 launch sends the first, systems the second]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+# What to do where the interpreter finds no ROS. [derived: README and docs/installation.md]
+_NO_ROS = (
+    'this Python finds no ROS 2 (rclpy): source its setup, such as /opt/ros/jazzy/setup.bash, or '
+    'use "make" in the checkout, which installs it; the command rs_relpose works without'
+)
+
 _stop: Callable[[], object] | None = None  # ends the spinning of the node
 
 
 def start(node: str) -> NoReturn:
     """Run the `main` of a node's module, and end the process with its exit code."""
+    if importlib.util.find_spec('rclpy') is None:
+        sys.stderr.write(f'{node}: error: {_NO_ROS}\n')
+        sys.exit(2)
     # Before any thread is made: threads inherit it.
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     threading.Thread(target=_wait_for_signal, name='signals', daemon=True).start()

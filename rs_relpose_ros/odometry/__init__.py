@@ -9,7 +9,6 @@ def need_gtsam() -> None:
     """Raise MissingInputError, with the command to install it, if gtsam is missing."""
     if importlib.util.find_spec('gtsam') is None:
         raise MissingInputError(
-            "odometry needs gtsam 4.3: pip install 'rs_relpose_ros[odometry]',"
-            " on a ROS machine pip install --no-deps 'gtsam>=4.3,<4.4' in a "
-            'venv (docs/odometry.md)'
+            "odometry needs gtsam 4.3: pip install 'gtsam>=4.3,<4.4', on a ROS machine with "
+            '--no-deps in a venv (docs/odometry.md)'
         )

@@ -514,7 +514,7 @@ def _write_ncore(model: Model, folder: Path) -> None:
     except ImportError as error:
         raise MissingInputError(
             'the format ncore needs the package nvidia-ncore: pip install '
-            f"'rs_relpose_ros[ncore]' ({error})"
+            f"'nvidia-ncore>=19.8' ({error})"
         ) from None
     both = [START, END] if model.rolls else [MIDDLE, MIDDLE]
     times = np.rint(model.times_ns[:, both] / 1000.0).astype(np.uint64)

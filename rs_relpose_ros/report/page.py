@@ -70,7 +70,8 @@ td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
   border-bottom: 1px solid var(--grid); } .finding p { margin: 0; max-width: none; }
 pre { background: var(--card); padding: 12px; border-radius: 8px; white-space: pre-wrap;
   font-size: .85rem; } summary { cursor: pointer; padding: 6px 0; }
-@media (max-width: 560px) { .finding { grid-template-columns: 1fr; }
+@media (max-width: 560px) { .finding { grid-template-columns: 1fr; } table { min-width: 0; }
+  td.number { white-space: normal; } .badge { min-width: 0; }
   body { padding: 0 12px 32px; } }
 """
 
@@ -323,17 +324,24 @@ def _calibration(observation: Observation, write: Writer) -> str:
 
 
 def _row(finding: Finding, write: Writer) -> str:
-    configured, estimated = (
-        ', '.join(f'{value:.4g}' for value in values)
-        for values in (finding.configured, finding.estimated)
-    )
-    sigma = '' if finding.sigma is None else f' &plusmn; {finding.sigma:.2g}'
-    unit = write(finding.unit)
+    unit, scale = ('ms', 1e3) if finding.unit == 's' else (finding.unit, 1.0)
+    configured = ', '.join(f'{scale * value:.4g}' for value in finding.configured)
+    estimated = with_sigma([scale * value for value in finding.estimated], finding.sigma, scale)
     return (
         f'<tr><td>{write(finding.code.value)}</td><td>{_badge(finding.state)}</td>'
-        f'<td class="number">{configured} {unit}</td>'
-        f'<td class="number">{estimated}{sigma} {unit}</td></tr>'
+        f'<td class="number">{configured} {write(unit)}</td>'
+        f'<td class="number">{estimated} {write(unit)}</td></tr>'
     )
+
+
+def with_sigma(values: Sequence[float], sigma: float | None, scale: float) -> str:
+    """Values with as many decimals as two digits of their sigma have, times `scale`."""
+    if sigma is None or not 0.0 < sigma < math.inf:
+        doubt = '' if sigma is None else f' &plusmn; {scale * sigma:.2g}'
+        return ', '.join(f'{value:.4g}' for value in values) + doubt
+    decimals = max(0, 1 - math.floor(math.log10(scale * sigma)))
+    numbers = ', '.join(f'{value:.{decimals}f}' for value in values)
+    return f'{numbers} &plusmn; {scale * sigma:.{decimals}f}'
 
 
 def _pairs(observation: Observation, write: Writer) -> str:
@@ -343,18 +351,28 @@ def _pairs(observation: Observation, write: Writer) -> str:
         return f'<p>No pair was estimated. {write(problem)}</p>'
     statuses = Counter(one.pose.status.value for one in observation.pairs)
     text = ', '.join(f'{count} {status}' for status, count in statuses.most_common())
-    reasons = Counter(one.pose.reason for one in observation.pairs if not one.pose)
-    unused = list(observation.unused.items())
-    listed = ''.join(
-        f'<li>{write(reason)} ({count})</li>'
-        for reason, count in (*reasons.most_common(5), *unused[:5])
-    )
+    unused = [f'{reason} ({count})' for reason, count in observation.unused.items()]
+    lines = [*lines_without_pose(observation), *unused[:5]]
+    listed = ''.join(f'<li>{write(line)}</li>' for line in lines)
     listing = f'<ul>{listed}</ul>' if listed else ''
     drawings = _drawings(plots.pairs(observation.pairs), write)
     return (
         f'<p>{len(observation.pairs)} pairs of {observation.frames} frames: {write(text)}.</p>'
         f'{listing}{drawings}'
     )
+
+
+def lines_without_pose(observation: Observation) -> Iterable[str]:
+    """A line for each status without a pose, with the most frequent reason."""
+    by_status: dict[str, Counter[str]] = {}
+    for one in observation.pairs:
+        if not one.pose:
+            reasons = by_status.setdefault(one.pose.status.value, Counter())
+            reasons[one.pose.reason] += 1
+    for status, reasons in by_status.items():
+        reason, _ = reasons.most_common(1)[0]
+        such_as = ', such as' if len(reasons) > 1 else ''
+        yield f'{status} ({reasons.total()}){such_as}: {reason}'
 
 
 def _frames(observation: Observation) -> str:

@@ -357,7 +357,8 @@ def clock(rates: Rates) -> list[Drawing]:
         draw(
             'rates',
             'Rate of the camera by images alone and by the gyro, axes of the camera: right, down, '
-            'forward.',
+            'forward. The images count all motion as rotation, so both differ while the camera '
+            'translates.',
             3.6,
             compared,
         ),
@@ -369,7 +370,7 @@ def clock(rates: Rates) -> list[Drawing]:
             correlated,
         ),
     ]
-    if len(middles):
+    if len(middles) > 1:
         text = 'The same offset in parts of the recording: a slope is a drift of the clocks.'
         drawings.append(draw('drift', text, 1.9, drifting))
     return drawings

@@ -413,7 +413,7 @@ def _follow(
         path = path_of([base.camera(pose) for pose in live], run.truth)
         return MetricPath('', path, float(np.sqrt(np.trace(covariance))))
     except ImportError:
-        return MetricPath("gtsam is not installed: pip install 'rs_relpose_ros[odometry]'")
+        return MetricPath("gtsam is not installed: pip install 'gtsam>=4.3,<4.4'")
     except RsRelposeError as error:
         return MetricPath(str(error))
     finally:

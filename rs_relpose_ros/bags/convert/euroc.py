@@ -19,7 +19,7 @@ from rs_relpose_ros.bags.convert.text_files import (
     read_rows,
     Row,
 )
-from rs_relpose_ros.config.calibration_files import calibration_of, plain_yaml
+from rs_relpose_ros.config.calibration_files import calibration_of, plain_yaml, yaml_problem
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.config.settings import IntrinsicsConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -79,7 +79,7 @@ def _yaml(path: Path) -> Any:
     try:
         return yaml.safe_load(plain_yaml(text))
     except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f'{path} is not valid YAML: {" ".join(str(error).split())}') from error
+        raise InputError(f'{path} is not valid YAML: {yaml_problem(error)}') from error
 
 
 def _camera(
