@@ -19,6 +19,7 @@ from rs_relpose_ros.calibration.observations import frames_of, Observations, Pai
 from rs_relpose_ros.calibration.offset_course import OffsetCourse, OffsetStep
 from rs_relpose_ros.calibration.trends import change_at, Trend, trends
 from rs_relpose_ros.core.deviations import OFFLINE
+from rs_relpose_ros.geometry import Array
 
 # Chi-square from which a parameter changes within the recording for certain. Less would find a
 # change by chance among a hundred borders. [chosen: 6 sigmas]
@@ -71,8 +72,10 @@ def confirmed(data: Observations, final: fit.Fit) -> OffsetCourse:
         if change is None or change.place != model.OFFSET or data.follows_intervals:
             return course
         if change.kind is Kind.DRIFT:
-            return OffsetCourse(drift=change.value, origin=float(np.median(data.times)))
-        return OffsetCourse((OffsetStep(change.begin, change.end, change.value),))
+            middle = float(np.median(data.times))
+            return OffsetCourse(drift=change.value, origin=middle)
+        step = OffsetStep(change.begin, change.end, change.value)
+        return OffsetCourse((step,))
     if data.follows_intervals:
         return course
     size = course.size + float(final.unknowns.parameters[model.SLOPE])
@@ -86,10 +89,11 @@ def certain_change(final: fit.Fit) -> Trend | None:
     if not found or found[0].square < _CERTAIN:
         return None
     best = found[0]
+    own = [one for one in found if one.place == best.place]
     others = [one.square for one in found if one.place != best.place]
     if best.square < max(others, default=0.0) + _LEAD:
         return None
-    drift = next(one for one in found if one.place == best.place and one.kind is Kind.DRIFT)
+    drift = next(one for one in own if one.kind is Kind.DRIFT)
     return drift if drift.square > best.square - _LEAD else best
 
 
@@ -134,17 +138,13 @@ def offset_changes(data: Observations, found: fit.Fit, of_row_0: Estimate) -> Of
     if not course.steps:
         drift = Estimate(course.drift, sigma, observable=True)
         return OffsetChanges((), drift, course.origin, (of_row_0.value,))
-    steps = tuple(
-        StepOfOffset(
-            step.begin,
-            step.end,
-            Estimate(step.seconds, _sigma_of(step, sigma), observable=True),
-        )
-        for step in course.steps
-    )
+    steps = []
+    for step in course.steps:
+        size = Estimate(step.seconds, _sigma_of(step, sigma), observable=True)
+        steps.append(StepOfOffset(step.begin, step.end, size))
     borders = [0.0, *(step.end for step in course.steps)]
     offsets = of_row_0.value + course.at(np.array(borders))
-    return OffsetChanges(steps, None, course.origin, tuple(offsets.tolist()))
+    return OffsetChanges(tuple(steps), None, course.origin, tuple(offsets.tolist()))
 
 
 # Sigma [s] of a step whose size is that of the compared offsets. [derived: steps of 5 ms, evenly
@@ -182,12 +182,14 @@ def _refined(data: Observations, final: fit.Fit, course: OffsetCourse) -> Offset
     slope = float(final.unknowns.parameters[model.SLOPE])
     if not course.steps:
         return course.changed(slope)
-    sizes = [change_at(final, model.OFFSET, one.middle) for one in course.steps]
-    steps = tuple(
-        replace(step, seconds=step.seconds + value, sigma=sigma) if sigma < step.sigma else step
-        for step, (value, sigma) in zip(course.steps, sizes, strict=True)
-    )
-    moved = replace(course, steps=steps)
+    steps = []
+    for step in course.steps:
+        value, sigma = change_at(final, model.OFFSET, step.middle)
+        if sigma < step.sigma:
+            steps.append(replace(step, seconds=step.seconds + value, sigma=sigma))
+        else:
+            steps.append(step)
+    moved = replace(course, steps=tuple(steps))
     if not data.follows_intervals:
         moved = moved.changed(slope)
     located = tuple(_located(data, final, moved, step) for step in moved.steps)
@@ -199,25 +201,30 @@ def _located(
 ) -> OffsetStep:
     """The step between the images where the pairs change from one offset to the other."""
     free_of_steps = data.following(OffsetCourse())
+    earliest = step.begin - _AROUND
+    latest = step.end + _AROUND
     pairs = [
         pair
         for pair in free_of_steps.pairs(_LOCATING, np.random.default_rng(0))
-        if step.begin - _AROUND < data.times[pair.first] < step.end + _AROUND
+        if earliest < data.times[pair.first] < latest
     ]
     if len(pairs) < _FEWEST_PAIRS:
         return step
-    begins, ends = data.times[frames_of(pairs)]
-    at_begin = float(course.at(np.array(step.begin - _AROUND)))
-    losses = []
-    for offset in (at_begin, at_begin + step.seconds):
+
+    def losses_at(offset: float) -> Array:
         parameters = final.unknowns.parameters.copy()
         parameters[model.OFFSET] += offset
         problem = free_of_steps.problem(pairs, float(parameters[model.OFFSET]))
-        unknowns = fit.restarted(problem, final.unknowns._replace(parameters=parameters))
-        losses.append(fit.evaluate(problem, unknowns).losses)
-    difference = losses[0] - losses[1]
+        moved = final.unknowns._replace(parameters=parameters)
+        unknowns = fit.restarted(problem, moved)
+        return fit.evaluate(problem, unknowns).losses
+
+    begins, ends = data.times[frames_of(pairs)]
+    at_begin = float(course.at(np.array(earliest)))
+    difference = losses_at(at_begin) - losses_at(at_begin + step.seconds)
     at_border = np.cumsum(difference) - difference
-    likely = np.flatnonzero(at_border <= at_border.min() + _NOT_KNOWN)
+    least = at_border.min()
+    likely = np.flatnonzero(at_border <= least + _NOT_KNOWN)
     # A pair that contains the step fits at neither offset.
     first = max(int(likely[0]) - 2, 0)
     last = min(int(likely[-1]) + 2, len(pairs) - 1)

@@ -105,17 +105,20 @@ class Selection:
         if unknown:
             raise ValueError(f'not the names of deviations: {sorted(unknown)}')
         chosen = [entry for entry in ENTRIES if entry.name in {*names, *bases}]
-        own = [bases.get(entry.name, np.eye(entry.size)) for entry in chosen]
-        sizes = [basis.shape[1] for basis in own]
-        parts = slices({entry.name: size for entry, size in zip(chosen, sizes, strict=True)})
-        whole = np.zeros((N_DEVIATIONS, sum(sizes)))
-        for (name, part), basis in zip(parts.items(), own, strict=True):
-            whole[PARTS[name], part] = basis
+        own = {entry.name: bases.get(entry.name, np.eye(entry.size)) for entry in chosen}
+        sizes = {name: basis.shape[1] for name, basis in own.items()}
+        counts = list(sizes.values())
+        parts = slices(sizes)
+        whole = np.zeros((N_DEVIATIONS, sum(counts)))
+        for name, basis in own.items():
+            whole[PARTS[name], parts[name]] = basis
+        sigmas = [entry.sigma for entry in chosen]
+        largest = [entry.largest for entry in chosen]
         return cls(
             whole,
             parts,
-            np.repeat([entry.sigma for entry in chosen], sizes),
-            np.repeat([entry.largest for entry in chosen], sizes),
+            np.repeat(sigmas, counts),
+            np.repeat(largest, counts),
         )
 
     @property

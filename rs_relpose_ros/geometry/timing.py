@@ -69,13 +69,14 @@ def correlation_of_steps(steps: Array) -> float:
         return 0.0
     # The few odd steps after the start of a camera must not decide.
     low, high = np.quantile(steps[whole], (0.05, 0.95))
-    deviations = np.clip(steps, low, high)
-    deviations -= deviations[whole].mean()
+    clipped = np.clip(steps, low, high)
+    deviations = clipped - clipped[whole].mean()
     both = whole[1:] & whole[:-1]
     first = deviations[:-1][both]
     second = deviations[1:][both]
-    variance = 0.5 * float(first @ first + second @ second)
-    return float(first @ second) / max(variance, 1e-24)
+    squares = float(first @ first + second @ second)
+    variance = max(0.5 * squares, 1e-24)
+    return float(first @ second) / variance
 
 
 def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:

@@ -104,17 +104,15 @@ def array(
         for size, found in zip(shape, checked.shape, strict=True)
     )
     if not fits:
+        sizes = ', '.join(map(str, shape))
         comma = ',' if len(shape) == 1 else ''
-        raise InputError(
-            f'{name} must have shape ({", ".join(map(str, shape))}{comma}), got {checked.shape}'
-        )
+        raise InputError(f'{name} must have shape ({sizes}{comma}), got {checked.shape}')
     legal = np.abs(checked) <= largest  # False for NaN
     if not legal.all():
         place = np.unravel_index(np.argmin(legal), legal.shape)
+        indices = [int(k) for k in place]
         text = 'finite' if largest == _FLOAT_MAX else f'finite and within {largest:g} {unit}'
-        raise InputError(
-            f'{name} must be {text.rstrip()}, got {checked[place]} at {[int(k) for k in place]}'
-        )
+        raise InputError(f'{name} must be {text.rstrip()}, got {checked[place]} at {indices}')
     return checked
 
 

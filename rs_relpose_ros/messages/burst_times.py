@@ -69,8 +69,9 @@ def find_bursts(stamps: Stamps) -> Bursts | None:
     if size < _SMALLEST_BURST:
         return None
     ends_ns = np.cumsum(steps)[starts]
+    duration_ns = float(ends_ns[-1] - ends_ns[0])
     samples = int(starts[-1] - starts[0])
-    return Bursts(round(size), samples * NANOSECONDS / float(ends_ns[-1] - ends_ns[0]))
+    return Bursts(round(size), samples * NANOSECONDS / duration_ns)
 
 
 # -- The line of their arrivals -------------------------------------------------------------------
@@ -144,7 +145,8 @@ class _EvenLine:
         common = math.hypot(of_burst, self._scatter_ns)
         # Sigma of a line at its end: twice the one of its middle. Of N residuals with a
         # correlation r from one to the next, N (1 - r) / (1 + r) are independent.
-        independent = len(self._numbers) * (1.0 - self._correlation) / (1.0 + self._correlation)
+        correlation = self._correlation
+        independent = len(self._numbers) * (1.0 - correlation) / (1.0 + correlation)
         varying = 2.0 * self._scatter_ns / math.sqrt(independent)
         return StampDoubt(common / NANOSECONDS, varying / NANOSECONDS)
 
@@ -162,8 +164,9 @@ class _EvenLine:
         first_ns = self._arrivals_ns[0]
         arrivals = np.array(self._arrivals_ns) - first_ns
         mean_arrival = float(arrivals.mean())
-        self._mean_number = float(np.mean(self._numbers))
-        from_mean = np.array(self._numbers) - self._mean_number
+        numbers = np.array(self._numbers)
+        self._mean_number = float(numbers.mean())
+        from_mean = numbers - self._mean_number
         deviations = arrivals - mean_arrival
         self._step_ns = float(from_mean @ deviations) / float(from_mean @ from_mean)
         residuals = deviations - self._step_ns * from_mean
@@ -190,7 +193,8 @@ def _correlation(residuals: NDArray[np.float64]) -> float:
     total = float(residuals @ residuals)
     if not total:
         return 0.0
-    return float(np.clip(residuals[:-1] @ residuals[1:] / total, 0.0, _LARGEST_CORRELATION))
+    of_neighbours = residuals[:-1] @ residuals[1:] / total
+    return float(np.clip(of_neighbours, 0.0, _LARGEST_CORRELATION))
 
 
 # -- Sample by sample -----------------------------------------------------------------------------

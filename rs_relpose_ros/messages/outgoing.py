@@ -325,17 +325,16 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
     matches = result.matches
     found = result.landmarks
     assert found is not None, 'only pairs with a pose have inliers to publish'
-    values = np.column_stack(
-        [
-            matches.points1,
-            matches.points2,
-            *matches.row_times,
-            *matches.rays,
-            found.points,
-            found.pixels1,
-            found.pixels2,
-        ]
-    )[inliers]
+    columns = [
+        matches.points1,
+        matches.points2,
+        *matches.row_times,
+        *matches.rays,
+        found.points,
+        found.pixels1,
+        found.pixels2,
+    ]
+    values = np.column_stack(columns)[inliers]
     records = np.empty(len(values), dtype=MATCH_DTYPE)
     records['id'] = matches.track_ids[inliers]
     for name, column in zip(_FLOATS, values.T, strict=True):
@@ -569,9 +568,10 @@ def quat_xyzw(R: Array) -> Array:
 
 def published_covariance(covariance: Array) -> Array:
     """A covariance (N, N) as in messages (N * N,): symmetric, no eigenvalue below 0."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
-    whole = (vectors * values) @ vectors.T
+    symmetric = 0.5 * (covariance + covariance.T)
+    values, vectors = np.linalg.eigh(symmetric)
+    least = _LEAST_EIGENVALUE * values[-1]
+    whole = (vectors * np.maximum(values, least)) @ vectors.T
     return (0.5 * (whole + whole.T)).ravel()
 
 
@@ -599,7 +599,8 @@ def _byte_data(values: NDArray[Any], message_type: Any) -> Any:
     """Bytes in the container of the message; rclpy copies an ndarray element by element."""
     if _is_rclpy(message_type):
         data = array('B')
-        data.frombytes(np.ascontiguousarray(values).ravel().view(np.uint8).data)
+        contiguous = np.ascontiguousarray(values).ravel()
+        data.frombytes(contiguous.view(np.uint8).data)
         return data
     return np.frombuffer(values.tobytes(), dtype=np.uint8)
 
@@ -655,9 +656,10 @@ def draw_pair(result: PairResult) -> Color:
         inliers = np.zeros(len(result.matches), dtype=bool)
     # Rows are columns of the image where the camera is read to the right or left.
     axis = result.readout_axis
-    shares = result.matches.points2[:, axis] / (width, height)[axis]
+    row_count = (width, height)[axis]
+    shares = result.matches.points2[:, axis] / row_count
     _draw_matches(canvas, result.matches, inliers, shares, scale)
-    _draw_row_times(canvas, result.matches, axis, (width, height)[axis])
+    _draw_row_times(canvas, result.matches, axis, row_count)
     caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
     _write(caption, _caption(result, int(inliers.sum())), (6, 16))
     return np.concatenate([canvas, caption])
@@ -693,10 +695,13 @@ def _draw_row_times(canvas: Color, matches: Matches, axis: int, row_count: int) 
     height, width = canvas.shape[:2]
     if axis == 1:
         canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, height))
-        places = (_BAR_WIDTH + 4, 14), (_BAR_WIDTH + 4, height - 6)
+        beside = _BAR_WIDTH + 4
+        places = (beside, 14), (beside, height - 6)
     else:
         canvas[:_BAR_WIDTH] = cv2.resize(_COLORS[None], (width, _BAR_WIDTH))
-        places = (4, _BAR_WIDTH + 14), (max(width - 64, 4), _BAR_WIDTH + 14)
+        below = _BAR_WIDTH + 14
+        last = max(width - 64, 4)
+        places = (4, below), (last, below)
     line = np.polyfit(rows, matches.row_times[1], 1)
     first_and_last = np.polyval(line, (0, row_count - 1))
     for time, place in zip(first_and_last, places, strict=True):
@@ -707,8 +712,9 @@ def _draw_row_times(canvas: Color, matches: Matches, axis: int, row_count: int) 
 
 def _caption(result: PairResult, inliers: int) -> str:
     pose = result.pose
-    model = f' {pose.diagnostics.model}' if pose else ''
-    residual = f', residual {pose.diagnostics.residual_rms:.2f} px' if pose else ''
+    found = pose.diagnostics
+    model = f' {found.model}' if pose else ''
+    residual = f', residual {found.residual_rms:.2f} px' if pose else ''
     return (
         f'{pose.status.value}{model}: {inliers} of {len(result.matches)} matches, '
         f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}'

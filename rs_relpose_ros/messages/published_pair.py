@@ -312,23 +312,28 @@ def _with_pose(pair: PublishedPair, messages: Mapping[str, Any]) -> PublishedPai
 
 def match_records(cloud: Any) -> NDArray[np.void]:
     """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory."""
-    found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
-    wanted = [(*field, 1) for field in outgoing.MATCH_FIELDS]
-    point_size = MATCH_DTYPE.itemsize
-    if found != wanted or int(cloud.point_step) != point_size or cloud.is_bigendian:
+    found = []
+    for column in cloud.fields:
+        layout = int(column.offset), int(column.datatype), int(column.count)
+        found.append((str(column.name), *layout))
+    wanted = [(*column, 1) for column in outgoing.MATCH_FIELDS]
+    wanted_size = MATCH_DTYPE.itemsize
+    point_size = int(cloud.point_step)
+    if found != wanted or point_size != wanted_size or cloud.is_bigendian:
+        wanted_names = ' '.join(MATCH_DTYPE.names or ())
         names = ' '.join(name[:20] for name, *_ in found[:20])
         endian = 'big' if cloud.is_bigendian else 'little'
         raise InputError(
-            f'~/matches must have the fields {" ".join(MATCH_DTYPE.names or ())}, little endian, '
-            f'{point_size} bytes a point; got {names or "none"}, {endian} endian, '
-            f'{int(cloud.point_step)} bytes'
+            f'~/matches must have the fields {wanted_names}, little endian, {wanted_size} bytes a '
+            f'point; got {names or "none"}, {endian} endian, {point_size} bytes'
         )
     data = np.frombuffer(cloud.data, dtype=np.uint8)
-    size = int(cloud.width) * int(cloud.height) * point_size
+    width = int(cloud.width)
+    height = int(cloud.height)
+    size = width * height * wanted_size
     if len(data) != size:
         raise InputError(
-            f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
-            f'{int(cloud.height)} points need {size}'
+            f'~/matches has {len(data)} bytes of data, but {width}x{height} points need {size}'
         )
     records = data.view(MATCH_DTYPE)
     _refuse_damaged(records)
@@ -339,7 +344,8 @@ def _refuse_damaged(records: NDArray[np.void]) -> None:
     """InputError if matches are not finite, or their rays no directions."""
     landmark = ('x', 'y', 'z')
     # A match without a landmark has NaN in all three of these.
-    is_without = np.logical_and.reduce([np.isnan(records[name]) for name in landmark])
+    unknown = [np.isnan(records[name]) for name in landmark]
+    is_without = np.logical_and.reduce(unknown)
     for name in MATCH_DTYPE.names or ():
         is_good = np.isfinite(records[name])
         if name in landmark:
@@ -348,7 +354,8 @@ def _refuse_damaged(records: NDArray[np.void]) -> None:
             raise InputError('~/matches must be finite')
     for view in '12':
         lengths = np.linalg.norm(_rays(records, view), axis=1)
-        if (np.abs(lengths - 1.0) > _UNIT_TOLERANCE).any():
+        errors = np.abs(lengths - 1.0)
+        if (errors > _UNIT_TOLERANCE).any():
             raise InputError(f'the rays x{view} y{view} z{view} of ~/matches must have length 1')
 
 
@@ -484,7 +491,8 @@ class PoseChain:
             step = replace(step, poses=(first,), new_path=self._reason, new_axes=self._new_axes)
             self._new_axes = False
         if pair:
-            self._position = self._position + start @ (step.scale * pair.t)
+            moved = step.scale * pair.t
+            self._position = self._position + start @ moved
         current = PathPose(pair.stamp_ns, self._R, self._position)
         return replace(step, poses=(*step.poses, current))
 
@@ -499,11 +507,12 @@ class PoseChain:
         if self._scale is None:
             self._scale = 1.0
             return PathStep(scale=1.0)
+        count = len(ratios)
         median = float(np.median(ratios))
         self._scale *= median
         scatter = robust_scale(ratios - median, 0.0, 0.0) / median
-        sigma = _OF_MEDIAN * scatter / math.sqrt(len(ratios))
-        return PathStep(scale=self._scale, shared_tracks=len(ratios), scale_sigma=sigma)
+        sigma = _OF_MEDIAN * scatter / math.sqrt(count)
+        return PathStep(scale=self._scale, shared_tracks=count, scale_sigma=sigma)
 
     def _end(self, reason: str, *, new_axes: bool = False) -> None:
         """End the path, with its axes if these are `new`; the first reason is the next path's."""

@@ -200,7 +200,8 @@ def find_multiplied(values: Array) -> tuple[float, str]:
         return 1.0, ''
     steps = np.diff(values, axis=0)
     repeated: NDArray[np.bool_] = np.all(steps == 0.0, axis=1)
-    bends = np.abs(np.diff(steps, axis=0)).max(axis=1)
+    second_differences = np.diff(steps, axis=0)
+    bends = np.abs(second_differences).max(axis=1)
     typical = float(np.quantile(bends, _MOST))
     on_line: NDArray[np.bool_] = np.asarray(bends < _ON_LINE * typical)
     for how, multiplied in (('repeated', repeated), ('interpolated', on_line)):

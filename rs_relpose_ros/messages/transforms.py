@@ -44,15 +44,8 @@ class FrameTree:
     def add(self, message: Any) -> None:
         """Add the transforms of a tf2_msgs/TFMessage that are rigid."""
         for stamped in message.transforms:
-            position = stamped.transform.translation
-            rotation = stamped.transform.rotation
-            quaternion = [rotation.x, rotation.y, rotation.z, rotation.w]
-            pose = np.eye(4)
-            pose[:3, 3] = position.x, position.y, position.z
-            length = np.linalg.norm(quaternion)
-            is_unit = abs(length - 1.0) < 1e-2
-            if is_unit and np.isfinite(pose).all():
-                pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+            pose = _rigid(stamped.transform)
+            if pose is not None:
                 # ROS 1 has names with and without a slash.
                 child = stamped.child_frame_id.lstrip('/')
                 parent = stamped.header.frame_id.lstrip('/')
@@ -80,6 +73,21 @@ class FrameTree:
         return frame, pose
 
 
+def _rigid(transform: Any) -> Array | None:
+    """Pose (4, 4) of a geometry_msgs/Transform; None if it is not finite or not a rotation."""
+    position = transform.translation
+    rotation = transform.rotation
+    quaternion = [rotation.x, rotation.y, rotation.z, rotation.w]
+    pose = np.eye(4)
+    pose[:3, 3] = position.x, position.y, position.z
+    length = np.linalg.norm(quaternion)
+    is_unit = abs(length - 1.0) < 1e-2
+    if not (is_unit and np.isfinite(pose).all()):
+        return None
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return pose
+
+
 def angle_between(R: Array, other: Array, sigma: float) -> float:
     """Angle [deg] between two rotations, R of `sigma` [rad]; 0 where they may be the same."""
     angle = float(Rotation.from_matrix(R @ other.T).magnitude())
@@ -93,6 +101,7 @@ def extrinsics(
     """Parameters by the pose `found` of the IMU in the camera; and a contradiction, or ''."""
     sensor = parameters.sensor
     position = parameters.imu.imu_position
+    found_position = found[:3]
     rotation = Rotation.from_quat(found[3:])
     head = f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
@@ -106,11 +115,15 @@ def extrinsics(
             'used, and nothing of the transform'
         )
     if not any(position):
-        return values | {'imu_position': found[:3], 'imu_position_sigma': POSITION_SIGMA}, ''
-    apart = float(np.abs(np.subtract(found[:3], position)).max())
-    if apart > 3.0 * math.hypot(POSITION_SIGMA, parameters.imu.imu_position_sigma):
+        values['imu_position'] = found_position
+        values['imu_position_sigma'] = POSITION_SIGMA
+        return values, ''
+    difference = np.subtract(found_position, position)
+    apart = float(np.abs(difference).max())
+    sigma = math.hypot(POSITION_SIGMA, parameters.imu.imu_position_sigma)
+    if apart > 3.0 * sigma:
         return values, (
-            f'{head} at {_text(found[:3])} m, imu_position is {_text(position)} m: '
+            f'{head} at {_text(found_position)} m, imu_position is {_text(position)} m: '
             'the parameter is used'
         )
     return values, ''
@@ -147,7 +160,8 @@ def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
     frames = BagFrames(camera, imu, FrameTree())
 
     def messages_of(name: str) -> Iterator[Any]:
-        topics = [one for one in bag.topics if (one.name, one.msgtype) == (name, TF_TYPE)]
+        of_transforms = [one for one in bag.topics if one.msgtype == TF_TYPE]
+        topics = [one for one in of_transforms if one.name == name]
         return (found.message for found in bag.messages(topics))
 
     for message in messages_of('/tf_static'):

@@ -118,7 +118,8 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
     steps = np.diff(recent) / NANOSECONDS
     # A quarter of the intervals has no lost image between, unless most images are lost.
     period = max(float(np.quantile(steps, 0.25, method='lower')), 1e-9)
-    sent = 1e-9 * (recent[-1] - recent[0]) / period + 1.0
+    duration = 1e-9 * (recent[-1] - recent[0])
+    sent = duration / period + 1.0
     arrived = len(recent) / sent
     if size >= LARGE_MESSAGE and arrived < _LOST:
         return (
@@ -130,8 +131,11 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
         )
     shares = steps / max(float(np.median(steps)), 1e-9)
     whole = steps[(shares > 0.0) & (shares < MISSING)]
-    # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
-    spread = float(np.subtract(*np.quantile(whole, (0.9, 0.1)))) if len(whole) else 0.0
+    spread = 0.0
+    if len(whole):
+        # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
+        longest, shortest = np.quantile(whole, (0.9, 0.1))
+        spread = float(longest - shortest)
     jitter = spread / 2.56 / math.sqrt(2.0)
     if jitter < _JITTER or correlation_of_steps(shares) > _ALTERNATING:
         return ''
@@ -303,8 +307,8 @@ class FrameStatistics(ABC):
                 share = f'{100.0 * progress.share:.0f}'
                 values.update(state='calibrating', progress=share, **progress.values)
             for role in TOPICS:
-                rate = (inputs[role] - before[role]) / elapsed
-                values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
+                arrived = inputs[role] - before[role]
+                values[f'{role.value}_rate_hz'] = f'{arrived / elapsed:.1f}'
             values['frames_received'] = counts.frames if counts else inputs[Role.IMAGE]
             values['frames_processed'] = taken
             values |= self._counters(counts, refused, inputs[INVALID])

@@ -329,8 +329,9 @@ class OdometryNode(StoppableNode):
 
     def _report(self) -> None:
         if self._path and self._path_topic.get_subscription_count():
-            path = message_class('nav_msgs/msg/Path')
-            self._path_topic.publish(path(header=self._path[-1].header, poses=list(self._path)))
+            path_class = message_class('nav_msgs/msg/Path')
+            poses = list(self._path)
+            self._path_topic.publish(path_class(header=poses[-1].header, poses=poses))
         self.warn_of_namesake()
         level, text = self._status()
         self.publish_status(level, 'odometry', text, self._pairs, self._values())

@@ -33,8 +33,9 @@ def draw_replay(
 ) -> list[Path]:
     """Draw matches of one pair, errors (with ground truth), residuals and rotation; the files."""
     matches, errors, residuals, rotation = paths
+    _, encoded = cv2.imencode('.png', draw_pair(shown))
     with written(matches, 'wb') as file:
-        file.write(cv2.imencode('.png', draw_pair(shown))[1].tobytes())
+        file.write(encoded.tobytes())
     draw_residuals(records, residuals)
     draw_rotation(records, rotation, truth)
     if truth is None:
@@ -62,32 +63,32 @@ def draw_errors(
     for axis, (name, sigmas_of, label) in zip(picture.axes, series, strict=True):
         if known:
             values = [getattr(record.errors, name) for record in known]
-            lengths = [np.linalg.norm(sigmas_of(record.pose.covariance)) for record in known]
-            sigmas = np.degrees(lengths)
+            of_records = [sigmas_of(record.pose.covariance) for record in known]
+            sigmas = np.degrees([np.linalg.norm(one) for one in of_records])
             axis.hlines(
                 sigmas, begins, ends, color=ORANGE, linewidth=2.2, label='1 sigma, as estimated'
             )
             axis.plot(middles, values, 'o', color=BLUE, markersize=5, label='error')
             _median_line(axis, values, f'median error {np.median(values):.2g} deg')
-            others_drawn = zip(
-                (baselines or {}).items(), cycle((RED, GREEN)), cycle('+x12'), strict=False
-            )
-            for (method, errors), color, marker in others_drawn:
-                others = [np.nan if one is None else getattr(one, name) for one in errors]
-                axis.plot(
-                    middles,
-                    others,
-                    marker,
-                    color=color,
-                    markersize=6,
-                    label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg',
-                )
+            _draw_others(axis, middles, name, baselines or {})
             axis.set_yscale('log')
             axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
             axis.yaxis.set_minor_formatter(NullFormatter())
         axis.set_ylabel(label)
         _shade_no_pose(axis, records, start_ns)
     _save_over_time(picture, path)
+
+
+def _draw_others(
+    axis: Axes, middles: Array, name: str, baselines: Mapping[str, Sequence[PairErrors | None]]
+) -> None:
+    """Draw the errors of other methods at the middles [s] of the pairs, and their medians."""
+    colors = cycle((RED, GREEN))
+    markers = cycle('+x12')
+    for (method, errors), color, marker in zip(baselines.items(), colors, markers, strict=False):
+        values = [np.nan if one is None else getattr(one, name) for one in errors]
+        label = f'{method}:\nmedian {np.nanmedian(values):.2g} deg'
+        axis.plot(middles, values, marker, color=color, markersize=6, label=label)
 
 
 def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
@@ -124,17 +125,19 @@ def draw_rotation(records: Sequence[PairRecord], path: Path, truth: TrueTrajecto
         2, 'orientation against the first keyframe: the rotations of the pairs, chained'
     )
     above, below = picture.axes
-    estimated = _vectors(chains['estimated'])
-    reference = _vectors(chains[against])
+    estimated = _vectors(chains['estimated']).T
+    reference = _vectors(chains[against]).T
     components = ((BLUE, 'x (right)'), (RED, 'y (down)'), (GREEN, 'z (forward)'))
-    for column, (color, name) in enumerate(components):
-        above.plot(times, estimated[:, column], 'o-', color=color, label=name, markersize=3)
-        label = against if column == 2 else None
-        above.plot(times, reference[:, column], '--', color='black', linewidth=1.0, label=label)
+    for (color, name), values in zip(components, estimated, strict=True):
+        above.plot(times, values, 'o-', color=color, label=name, markersize=3)
+    labels = (None, None, against)  # once for all three
+    for label, values in zip(labels, reference, strict=True):
+        above.plot(times, values, '--', color='black', linewidth=1.0, label=label)
     above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
     *others, true = chains.values()
     for name, chain, color in zip(chains, others, (BLUE, ORANGE), strict=False):
-        angles = [rotation_angle(R.T @ R_true) for R, R_true in zip(chain, true, strict=True)]
+        differences = [R.T @ R_true for R, R_true in zip(chain, true, strict=True)]
+        angles = [rotation_angle(one) for one in differences]
         label = f'{name} against {against}'
         below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4, label=label)
     below.set_ylabel('difference, accumulated\n[deg]')

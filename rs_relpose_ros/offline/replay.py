@@ -263,7 +263,8 @@ def replay_into(
                     writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], make(), run.last_ns)
             on_pair(pair)
             # The better picture: with a pose, many inliers and much parallax.
-            rank = bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
+            inliers = pair.pose.inliers.sum()
+            rank = bool(pair.pose), float(inliers * pair.parallax)
             if pictures and (shown is None or rank > best):
                 shown = pair
                 best = rank
@@ -275,9 +276,8 @@ def replay_into(
         from rs_relpose_ros.offline.pictures import draw_replay
 
         files += draw_replay([folder / name for name in PICTURES], records, shown, truth)
-    summary = _summary(records, run, last, health) | {
-        'residual_maps': [one.as_json() for one in maps]
-    }
+    summary = _summary(records, run, last, health)
+    summary['residual_maps'] = [one.as_json() for one in maps]
     return ReplayOutcome(records, summary, health, files, run.intake.intrinsics, maps)
 
 
@@ -358,16 +358,13 @@ def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
     """Ground truth of the camera; None if the bag has none."""
     if topics.truth is None:
         return None
-    poses = [
-        PARTS[role].read(message.message)
-        for role, message in sensor_messages(bag, topics, (Role.TRUTH,))
-    ]
+    messages = sensor_messages(bag, topics, (Role.TRUTH,))
+    poses = [PARTS[role].read(message.message) for role, message in messages]
+    stamps_ns = [pose.stamp_ns for pose in poses]
+    positions = [pose.position for pose in poses]
+    quaternions = [pose.quat_xyzw for pose in poses]
     try:
-        return TrueTrajectory(
-            [pose.stamp_ns for pose in poses],
-            np.array([pose.position for pose in poses]),
-            np.array([pose.quat_xyzw for pose in poses]),
-        )
+        return TrueTrajectory(stamps_ns, np.array(positions), np.array(quaternions))
     except InputError as error:
         raise InputError(f'{topics.truth.name}: {error}') from error
 
@@ -419,25 +416,24 @@ def pairs_into(
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE))
     truth = read_truth(bag, topics)
     results, intrinsics = related(bag, topics, parameters, pairs)
-    records = [
-        PairRecord.of(result, truth)
-        if isinstance(result, PairResult)
-        else PairRecord(*pair, RelativePose(status=Status.BAD_INPUT, reason=result))
-        for pair, result in zip(pairs, results, strict=True)
-    ]
+    records = []
+    for pair, result in zip(pairs, results, strict=True):
+        if isinstance(result, PairResult):
+            records.append(PairRecord.of(result, truth))
+        else:
+            no_pose = RelativePose(status=Status.BAD_INPUT, reason=result)
+            records.append(PairRecord(*pair, no_pose))
     written = (CHOSEN_POSES,) if truth is None else (CHOSEN_POSES, ERRORS)
     with tables.table_writer(folder, written) as write:
         for record in records:
             write(record)
+    answered = [record for record in records if record.pose]
     metrics = {
         'pairs': pair_counts(records),
-        'errors_against_truth': tables.errors_against_truth(
-            [record for record in records if record.pose]
-        ),
+        'errors_against_truth': tables.errors_against_truth(answered),
     }
-    return ReplayOutcome(
-        records, metrics, NOT_EVALUATED, [folder / table.file for table in written], intrinsics
-    )
+    files = [folder / table.file for table in written]
+    return ReplayOutcome(records, metrics, NOT_EVALUATED, files, intrinsics)
 
 
 def related(
@@ -446,8 +442,9 @@ def related(
     """Results of the pairs, or the reasons why they were not estimated; active intrinsics."""
     warm_up(parameters.estimator)
     wanted = [pair for pair in pairs if pair[0] < pair[1]]
+    stamps = {stamp for pair in wanted for stamp in pair}
     loop = FrameLoop(parameters, ChosenPairs(wanted), offline=True)
-    intake = Intake(loop.sequencer, parameters, {stamp for pair in wanted for stamp in pair})
+    intake = Intake(loop.sequencer, parameters, stamps)
     results: dict[PairStamps, PairResult | str] = {}
     problems: dict[int, str] = {}
     for outcome in outcomes(loop, intake, sensor_messages(bag, topics)):

@@ -43,8 +43,9 @@ class TrueTrajectory:
     """
 
     def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:
+        given_stamps = np.asarray(stamps_ns, dtype=np.int64)
         # Of poses with the same stamp the first one holds.
-        stamps, order = np.unique(np.asarray(stamps_ns, dtype=np.int64), return_index=True)
+        stamps, order = np.unique(given_stamps, return_index=True)
         positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)[order]
         quats = np.asarray(quats_xyzw, dtype=np.float64).reshape(-1, 4)[order]
         if len(order) < _MIN_POSES:
@@ -67,7 +68,8 @@ class TrueTrajectory:
 
     def _seconds(self, at_ns: ArrayLike) -> Array:
         """Seconds since the first pose: absolute stamps do not fit into a float."""
-        return np.asarray((np.asarray(at_ns, dtype=np.int64) - self._stamps[0]) / NANOSECONDS)
+        since_first_ns = np.asarray(at_ns, dtype=np.int64) - self._stamps[0]
+        return np.asarray(since_first_ns / NANOSECONDS)
 
     def covers(self, at_ns: int) -> bool:
         """Whether there are poses close enough before and after a time."""
@@ -75,8 +77,9 @@ class TrueTrajectory:
         after = int(np.searchsorted(stamps, at_ns))
         if after == len(stamps):
             return False
-        has_near_ones = after > 0 and stamps[after] - stamps[after - 1] <= _MAX_GAP_NS
-        return bool(has_near_ones or stamps[after] == at_ns)
+        if stamps[after] == at_ns:
+            return True
+        return bool(after > 0 and stamps[after] - stamps[after - 1] <= _MAX_GAP_NS)
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""

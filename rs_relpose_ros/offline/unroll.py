@@ -55,7 +55,8 @@ class Unrolling:
         copied = [topic for topic in self._bag.topics if self._bag.can_be_copied(topic)]
         for topic in copied:
             self._writer.announce(topic, self._bag.origin(topic))
-        self.topics_copied = len({*copied} - {self._topics.image, self._topics.camera_info})
+        derotated = {self._topics.image, self._topics.camera_info}
+        self.topics_copied = len({*copied} - derotated)
         for outcome in outcomes(self._loop, self._intake, self._messages(copied)):
             times = self._times.get(outcome.stamp_ns)
             bag_time_ns = times.popleft() if times else None
@@ -66,11 +67,9 @@ class Unrolling:
             if isinstance(outcome, MessageRefused) and not self.images:
                 outcome.raise_without_intrinsics()
             self.reasons.add(unused_reason(outcome))
-        self.warnings += [
-            f'{topic} is omitted: ROS 2 has no such message type'
-            for topic in self._bag.topics
-            if topic not in copied
-        ]
+        omitted = [topic for topic in self._bag.topics if topic not in copied]
+        for topic in omitted:
+            self.warnings.append(f'{topic} is omitted: ROS 2 has no such message type')
         shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
         if shared and stamp_clock == 'imu':
             self.warnings.append(
@@ -114,9 +113,8 @@ class Unrolling:
         origin = result.stamp_ns, result.frame_id
         pixels = result.image()
         if topic.msgtype == sensor_topics.COMPRESSED_IMAGE:
-            image = outgoing.compressed_image_message(
-                *origin, pixels, png=result.is_png, types=types
-            )
+            png = result.is_png
+            image = outgoing.compressed_image_message(*origin, pixels, png=png, types=types)
         else:
             image = outgoing.image_message(*origin, pixels, types)
         published = self._intake.camera_info_of(result.intrinsics)

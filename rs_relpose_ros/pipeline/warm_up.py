@@ -114,9 +114,10 @@ def _images() -> Iterator[NDArray[np.uint8]]:
     """A far wall behind a near one, from a camera that moves and then stops."""
     noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
     layers = [cv2.GaussianBlur(layer, (0, 0), 2.0) for layer in noise]
-    far, near = (
+    stretched = [
         cv2.normalize(layer, np.empty_like(layer), 0, 255, cv2.NORM_MINMAX) for layer in layers
-    )
+    ]
+    far, near = stretched
     for shift in (0, 4, 8, 8):
         image = np.roll(far, -shift, axis=1)
         image[80:160] = np.roll(near[80:160], -3 * shift, axis=1)

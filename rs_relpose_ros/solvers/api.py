@@ -193,9 +193,9 @@ def as_function(row: Solver) -> Callable[..., list[MinimalSolution]]:
 
     solve.__name__ = solve.__qualname__ = row.name
     rays = 'derotated by the gyro' if row.model.derotated else 'as measured'
-    solve.__doc__ = f'{row.summary}\n\n    {str(row.solve.__doc__).rstrip()}' + _ARGUMENTS.format(
-        n=n, rays=rays
-    )
+    of_kernel = str(row.solve.__doc__).rstrip()
+    arguments = _ARGUMENTS.format(n=n, rays=rays)
+    solve.__doc__ = f'{row.summary}\n\n    {of_kernel}{arguments}'
     return solve
 
 
@@ -210,6 +210,7 @@ def _alignment(name: str, gravity: ArrayLike | None) -> Array:
 
 def _solutions(row: Solver, sample: Sample, known: Knowledge) -> Iterator[MinimalSolution]:
     out = common.empty_solutions(row.most_solutions)
-    for k in range(common.run_solver(row.address, sample, known, out)):
-        t, d1, d2 = out.x[k].reshape(3, 3)  # d1 and d2 are zero without velocities
-        yield MinimalSolution(out.R[k], t, d1, out.R[k].T @ d2)
+    count = common.run_solver(row.address, sample, known, out)
+    for R, x in zip(out.R[:count], out.x, strict=False):
+        t, d1, d2 = x.reshape(3, 3)  # d1 and d2 are zero without velocities
+        yield MinimalSolution(R, t, d1, R.T @ d2)

@@ -161,7 +161,8 @@ def _spread(
     """
     both = np.concatenate([taken, points])
     column, row = (both // cell).astype(np.int64).T
-    cells = row * (column.max(initial=0) + 1) + column
+    columns = column.max(initial=0) + 1
+    cells = row * columns + column
     by_cell = np.argsort(cells, kind='stable')
     _, starts, sizes = np.unique(cells[by_cell], return_index=True, return_counts=True)
     place = np.arange(len(both)) - np.repeat(starts, sizes)  # within the cell
@@ -284,7 +285,8 @@ class DescriptorTracker:
     # -- inside ------------------------------------------------------------------------------
 
     def _detect(self, image: Image) -> _Keypoints:
-        nothing = _Keypoints(self._ids.take(0), np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8))
+        no_descriptors = np.empty((0, 0), dtype=np.uint8)
+        nothing = _Keypoints(self._ids.take(0), np.empty((0, 2)), no_descriptors)
         if min(image.shape) < _SMALLEST_SIDE:
             return nothing
         keypoints, descriptors = self._detector.detectAndCompute(image, None)
@@ -293,12 +295,12 @@ class DescriptorTracker:
         points = np.array([k.pt for k in keypoints], dtype=np.float64)
         rows = points[:, 1]
         first, last = feature_rows(self._config, image.shape[0])
-        kept = (rows >= first) & (rows <= last) & within(points, self._allowed)
+        in_rows = (rows >= first) & (rows <= last)
         # One keypoint a place: SIFT repeats a place with several orientations.
         _, once = np.unique(points, axis=0, return_index=True)
         is_first = np.zeros(len(points), dtype=bool)
         is_first[once] = True
-        kept &= is_first
+        kept = in_rows & is_first & within(points, self._allowed)
         ids = self._ids.take(int(kept.sum()))
         chosen: Descriptors = np.ascontiguousarray(descriptors[kept])  # type: ignore[assignment]
         return _Keypoints(ids, points[kept], chosen)

@@ -54,7 +54,8 @@ class GrayLevels:
 
     def gray(self, pixels: NDArray[np.uint16]) -> Image:
         """Gray image (H, W) of the next image."""
-        low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
+        some = pixels[::_STRIDE, ::_STRIDE]
+        low, high = np.percentile(some, _ENDS)
         filled = high - low
         fewest = _LEAST_FILLED * (self._high - self._low)
         is_outside = low < self._low or high > self._high
@@ -99,7 +100,8 @@ def encoded_image_size(data: Bytes) -> tuple[int, int]:
     start = data[:_PNG_HEADER].tobytes()
     end = data[-_PADDING:].tobytes()
     if start.startswith(_PNG_SIGNATURE):
-        if len(start) < _PNG_HEADER or start[12:16] != b'IHDR' or b'IEND' not in end:
+        begins = len(start) == _PNG_HEADER and start[12:16] == b'IHDR'
+        if not begins or b'IEND' not in end:
             raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')
         width, height = struct.unpack('>II', start[16:24])
         return width, height

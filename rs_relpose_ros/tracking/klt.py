@@ -249,7 +249,8 @@ def window_homography(points1: Array, points2: Array) -> Array:
     """
     if len(points1) < _LEAST_FITTED:
         return np.eye(3)
-    some = slice(None, None, -(-len(points1) // _FITTED))
+    step = -(-len(points1) // _FITTED)
+    some = slice(None, None, step)
     fitted, _ = cv2.findHomography(points1[some], points2[some], method=0)
     # Without a solution OpenCV returns None: an array without shape.
     H = np.asarray(fitted, dtype=np.float64)
@@ -259,7 +260,9 @@ def window_homography(points1: Array, points2: Array) -> Array:
     # Area of the image of a small window: det H / scale^3.
     with np.errstate(all='ignore'):
         area = np.linalg.det(H) / scale**3
-    if not ((area > 1.0 / _LARGEST_STRETCH) & (area < _LARGEST_STRETCH)).all():
+    is_large = area > 1.0 / _LARGEST_STRETCH
+    is_small = area < _LARGEST_STRETCH
+    if not (is_large & is_small).all():
         return np.eye(3)
     return H
 

@@ -94,8 +94,9 @@ class StillParts:
         self._earlier: list[tuple[int, NDArray[np.float32]]] = []
         self._counted: deque[tuple[int, Flags, Flags]] = deque()
         # Of these images, in how many each cell was informative, and in how many it was still.
-        self._informative = np.zeros((ROWS, COLUMNS), dtype=int)
-        self._still = np.zeros((ROWS, COLUMNS), dtype=int)
+        cells = (ROWS, COLUMNS)
+        self._informative = np.zeros(cells, dtype=int)
+        self._still = np.zeros(cells, dtype=int)
 
     def add(self, stamp_ns: int, image: Image, motion: Array) -> bool:
         """Add the next image (H, W); whether it repeats the last new image.
@@ -148,7 +149,8 @@ class StillParts:
         first_ns, first = earlier[0]
         if stamp_ns - first_ns < _EARLIER_NS:
             return np.zeros(expected.shape, dtype=bool)
-        return np.asarray(_cell_means(np.abs(reduced - first)) < _STILL * expected)
+        changed = _cell_means(np.abs(reduced - first))
+        return np.asarray(changed < _STILL * expected)
 
     def static(self) -> Flags:
         """Cells (ROWS, COLUMNS) that are static by the images of the last seconds."""
@@ -168,15 +170,19 @@ class StillParts:
 
 def cell_centres(width: int, height: int) -> Array:
     """Pixels (ROWS, COLUMNS, 2) of the centres of the cells of an image."""
-    u = (np.arange(COLUMNS) + 0.5) * (width / COLUMNS) - 0.5
-    v = (np.arange(ROWS) + 0.5) * (height / ROWS) - 0.5
+    cell_width = width / COLUMNS
+    cell_height = height / ROWS
+    u = (np.arange(COLUMNS) + 0.5) * cell_width - 0.5
+    v = (np.arange(ROWS) + 0.5) * cell_height - 0.5
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def free_of(static: Flags, width: int, height: int) -> NDArray[np.uint8]:
     """Mask (H, W): 255 where new features may lie, 0 in static cells and their neighbours."""
-    grown = cv2.dilate(static.astype(np.uint8), np.ones((3, 3), dtype=np.uint8))
-    mask = cv2.resize(255 * (1 - grown), (width, height), interpolation=cv2.INTER_NEAREST)
+    neighbours = np.ones((3, 3), dtype=np.uint8)
+    grown = cv2.dilate(static.astype(np.uint8), neighbours)
+    allowed = 255 * (1 - grown)
+    mask = cv2.resize(allowed, (width, height), interpolation=cv2.INTER_NEAREST)
     return mask.astype(np.uint8, copy=False)
 
 
@@ -189,24 +195,20 @@ def _compared(
     # many image widths, which `remap` would reflect at the border one width at a time.
     known = (np.abs(motion) < width).all(axis=2)  # NaN is not known either
     field = np.where(known[..., np.newaxis], motion, 0.0).astype(np.float32)
-    turned = known & (np.linalg.norm(field, axis=2) >= _LEAST_MOTION)
+    lengths = np.linalg.norm(field, axis=2)
+    turned = known & (lengths >= _LEAST_MOTION)
     if not turned.any():
         return turned, np.zeros(turned.shape), turned
     dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-    u = np.arange(width, dtype=np.float32)
-    v = np.arange(height, dtype=np.float32)
     # The content of a pixel comes from where the motion began.
-    moved = cv2.remap(
-        before,
-        u - dense[..., 0],
-        v[:, np.newaxis] - dense[..., 1],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REFLECT,
-    )
+    u = np.arange(width, dtype=np.float32) - dense[..., 0]
+    v = np.arange(height, dtype=np.float32)[:, np.newaxis] - dense[..., 1]
+    moved = cv2.remap(before, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     expected = _cell_means(np.abs(moved - before))
     changed = _cell_means(np.abs(now - before))
     informative = turned & (expected >= _LEAST_CHANGE)
-    return np.asarray(informative), expected, np.asarray(changed < _STILL * expected)
+    still = changed < _STILL * expected
+    return np.asarray(informative), expected, np.asarray(still)
 
 
 def _cell_means(values: NDArray[np.float32]) -> Array:

@@ -91,7 +91,8 @@ def _layout(
     count = len(points)
     side = 2 * radius + 1
     columns = math.isqrt(max(count - 1, 0)) + 1
-    rows = max(-(-count // columns), 1)
+    full_rows = -(-count // columns)
+    rows = max(full_rows, 1)
     row, column = np.divmod(np.arange(count), columns)
     corners = side * np.column_stack([column, row])
     return centres, corners, (side * rows, side * columns)

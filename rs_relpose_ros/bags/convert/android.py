@@ -158,7 +158,8 @@ def _intrinsics(path: Path, orientation: int | None) -> list[SourcedValue]:
         return []
     found = read_object(path)
     values: list[Any] = [found.get(name) for name in ('fx', 'fy', 'cx', 'cy')]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+    are_numbers = all(isinstance(value, int | float) for value in values)
+    if not are_numbers or not all(map(math.isfinite, values)):
         raise InputError(f'{path} must have the numbers fx, fy, cx and cy')
     fx, fy, cx, cy = map(float, values)
     matrix = fx, fy, cx, cy
@@ -194,21 +195,17 @@ def read_mars(folder: Path) -> Recording:
     readout = 'Frame readout time[nanosec]'
     lens = _nominal_lens(metadata, video.width, video.height)
     offset = f'NOT KNOWN: {clock}. `rs_relpose calibrate` measures it.'
-    return phone_recording(
-        folder,
-        ': recorded with the MARS Logger',
-        video.frames(stamps_ns, stamps),
-        imu,
-        (),
-        [
-            *skew_values(reals(metadata, readout), readout),
-            *exposure_values(reals(metadata, 'Exposure time[nanosec]')),
-            *lens,
-            STAMP_ROW_OF_ANDROID,
-            SourcedValue('time_offset', 0.0, offset),
-        ],
-        displayed_axes(video, imu),
-    )
+    values = [
+        *skew_values(reals(metadata, readout), readout),
+        *exposure_values(reals(metadata, 'Exposure time[nanosec]')),
+        *lens,
+        STAMP_ROW_OF_ANDROID,
+        SourcedValue('time_offset', 0.0, offset),
+    ]
+    details = ': recorded with the MARS Logger'
+    images = video.frames(stamps_ns, stamps)
+    axes = displayed_axes(video, imu)
+    return phone_recording(folder, details, images, imu, (), values, axes)
 
 
 def _nominal_lens(metadata: list[Row], width: int, height: int) -> list[SourcedValue]:

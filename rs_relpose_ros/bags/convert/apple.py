@@ -33,7 +33,9 @@ from rs_relpose_ros.bags.convert.text_files import (
 from rs_relpose_ros.bags.convert.video import Video
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY, Vector
+from rs_relpose_ros.geometry.timing import Stamps
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.imu.integration import interpolated
 from rs_relpose_ros.messages.incoming import TruePose
@@ -84,16 +86,7 @@ def read_ios_logger(folder: Path) -> Recording:
         ImuSample(row.seconds_as_nanoseconds(0), row.vector(1, 2, 3), None)
         for row in headless_rows(folder / 'Gyro.txt', 4)
     ]
-    accel = []
-    forces_file = folder / 'Accel.txt'
-    if forces_file.is_file():
-        samples = list(headless_rows(forces_file, 4))
-        vectors = [row.vector(1, 2, 3) for row in samples]
-        forces = _specific_forces(forces_file, vectors, -1.0)
-        accel = [
-            ImuSample(row.seconds_as_nanoseconds(0), None, force)
-            for row, force in zip(samples, forces, strict=True)
-        ]
+    accel = _ios_logger_forces(folder / 'Accel.txt')
     lens = []
     if 5 in rows[0].words:
         of_frames = [[row.real(column) for column in range(2, 6)] for row in rows]
@@ -103,6 +96,19 @@ def read_ios_logger(folder: Path) -> Recording:
     details = ': recorded with ios_logger'
     axes = displayed_axes(video, accel)
     return phone_recording(folder, details, images, gyro, accel, (*lens, _STAMP_ROW), axes)
+
+
+def _ios_logger_forces(path: Path) -> list[ImuSample]:
+    """Read specific forces; none without the file."""
+    if not path.is_file():
+        return []
+    rows = headless_rows(path, 4)
+    vectors = [row.vector(1, 2, 3) for row in rows]
+    forces = _specific_forces(path, vectors, -1.0)
+    return [
+        ImuSample(row.seconds_as_nanoseconds(0), None, force)
+        for row, force in zip(rows, forces, strict=True)
+    ]
 
 
 # -- Stray Scanner --------------------------------------------------------------------------------
@@ -184,11 +190,8 @@ def read_sensor_logger(folder: Path) -> Recording:
 
 def _sensor_logger_images(folder: Path) -> tuple[Video | None, tuple[RecordedImage, ...]]:
     """Read the only video, or the images; names are times in ms since 1970."""
-    times_ns = {
-        path: int(path.stem) * 1_000_000
-        for path in sorted(folder.iterdir())
-        if path.stem.isdecimal()
-    }
+    named = [path for path in sorted(folder.iterdir()) if path.stem.isdecimal()]
+    times_ns = {path: int(path.stem) * 1_000_000 for path in named}
     videos = [path for path in times_ns if path.suffix.lower() in ('.mp4', '.mov')]
     if len(videos) > 1:
         raise InputError(f'{folder} has {len(videos)} videos: there must be one')
@@ -233,12 +236,17 @@ def _sensor_logger_forces(folder: Path) -> list[ImuSample]:
     return [ImuSample(stamp, None, force) for stamp, force in zip(stamps_ns, forces, strict=True)]
 
 
+def _series(rows: Sequence[Row]) -> tuple[Stamps, Array]:
+    """Stamps (N,) [ns] and vectors (N, 3) of a table."""
+    stamps_ns = [row.nanoseconds('time') for row in rows]
+    vectors = [row.vector(*'xyz') for row in rows]
+    return np.array(stamps_ns), np.array(vectors)
+
+
 def _sums(rows: Sequence[Row], gravities: Sequence[Row]) -> list[Vector]:
     """Add gravity, which changes slowly and is interpolated, to accelerations without it."""
-    vectors = np.array([row.vector(*'xyz') for row in rows])
-    gravity = np.array([row.vector(*'xyz') for row in gravities])
-    stamps_ns = np.array([row.nanoseconds('time') for row in rows])
-    gravity_ns = np.array([row.nanoseconds('time') for row in gravities])
+    stamps_ns, vectors = _series(rows)
+    gravity_ns, gravity = _series(gravities)
     times = (stamps_ns - gravity_ns[0]) * 1e-9
     gravity_times = (gravity_ns - gravity_ns[0]) * 1e-9
     sums = vectors + interpolated(times, gravity_times, gravity)

@@ -61,6 +61,7 @@ def read_euroc(folder: Path) -> Recording:
     truth: tuple[TruePose, ...] = ()
     if T_cam_body is not None:
         truth = _truth(root, np.asarray(np.linalg.inv(T_cam_body)))
+    is_png = rows[0].word(1).endswith('.png')
     return Recording(
         camera,
         images,
@@ -70,7 +71,7 @@ def read_euroc(folder: Path) -> Recording:
         '`rs_relpose calibrate` measures it.',
         (recording.COMPRESSED, *values),
         truth=truth,
-        image_format=recording.GRAY_PNG if rows[0].word(1).endswith('.png') else 'jpeg',
+        image_format=recording.GRAY_PNG if is_png else 'jpeg',
     )
 
 
@@ -142,10 +143,16 @@ def _truth(root: Path, T_body_cam: Array) -> tuple[TruePose, ...]:
 
 
 def _pose(row: Row, T_body_cam: Array) -> TruePose:
-    R_world_body = Rotation.from_quat(row.quaternion(5, 6, 7, 4))  # w is the first one
+    body_quat_xyzw = row.quaternion(5, 6, 7, 4)  # w is the first one
+    R_world_body = Rotation.from_quat(body_quat_xyzw)
     R_body_cam = Rotation.from_matrix(T_body_cam[:3, :3])
     R_world_cam = R_world_body * R_body_cam
     to_camera = R_world_body.apply(T_body_cam[:3, 3])
-    x, y, z = (np.array(row.vector(1, 2, 3)) + to_camera).tolist()
+    position = np.array(row.vector(1, 2, 3)) + to_camera
+    x, y, z = position.tolist()
     qx, qy, qz, qw = R_world_cam.as_quat().tolist()
-    return TruePose(row.nanoseconds(0), (x, y, z), (qx, qy, qz, qw))
+    return TruePose(
+        row.nanoseconds(0),
+        (x, y, z),
+        (qx, qy, qz, qw),
+    )

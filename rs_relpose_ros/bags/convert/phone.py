@@ -53,13 +53,15 @@ _DEFAULTS = (
 def read_phone(folder: Path, readers: Mapping[str, Reader]) -> Recording:
     """Read a recording of a known logger; MissingInputError if it is of none of them."""
     place = convert.found(folder)
-    if place is not None and place[1].name in readers:
-        return readers[place[1].name](place[0])
-    if place is not None and place[1].source != 'phone':
-        raise MissingInputError(
-            f'{folder} is a recording of {place[1]}: '
-            f'rs_relpose convert {place[1].source} {place[0]} OUT_BAG'
-        )
+    if place is not None:
+        inner, found = place
+        if found.name in readers:
+            return readers[found.name](inner)
+        if found.source != 'phone':
+            raise MissingInputError(
+                f'{folder} is a recording of {found}: '
+                f'rs_relpose convert {found.source} {inner} OUT_BAG'
+            )
     known = '; '.join(str(one) for one in convert.FORMATS if one.name in readers)
     raise MissingInputError(f'{folder} is of no known logger, by its files: {known}')
 
@@ -146,7 +148,9 @@ def displayed_axes(video: Video, accel: Sequence[ImuSample]) -> SourcedValue:
     # 0: upright; 90: the left side of the screen is at the top.
     held = math.degrees(math.atan2(-up[0], up[1]))
     nearest = 90 * round(held / 90.0)
-    tilted = math.hypot(held - nearest, math.degrees(math.atan2(up[2], math.hypot(*up[:2]))))
+    in_screen = math.hypot(up[0], up[1])
+    leaned = math.degrees(math.atan2(up[2], in_screen))
+    tilted = math.hypot(held - nearest, leaned)
     orientation = (video.display_rotation - nearest) % 360
     if tilted > _MOST_TILTED or orientation not in (90, 270):
         return camera_axes()
