@@ -74,9 +74,9 @@ def about_one_axis(axis: int, duration: float) -> Trajectory:
     """Camera that sways about one axis (0 yaw, 1 pitch, 2 roll) and is carried sideways."""
     spacing = 0.03
     times = -1.0 + spacing * np.arange(math.ceil((duration + 2.0) / spacing))
-    positions = np.column_stack(
-        [0.3 * np.sin(times), 0.5 * np.cos(0.7 * times), np.full(len(times), 1.6)]
-    )
+    x = 0.3 * np.sin(times)
+    y = 0.5 * np.cos(0.7 * times)
+    positions = np.column_stack([x, y, np.full(len(times), 1.6)])
     angles = np.zeros((len(times), 3))
     angles[:, axis] = 0.4 * np.sin(1.9 * times) + 0.1 * np.sin(5.0 * times)
     return Trajectory(positions, angles, float(times[0]), spacing, ())
@@ -127,10 +127,10 @@ def _gyro(
     count = int((end + 0.5) * truth.gyro_rate)
     times = -0.5 + (np.arange(count) + rng.uniform()) / truth.gyro_rate
     rates = trajectory.states(times).angular_velocity @ truth.R_cam_imu
-    noise = truth.gyro_noise * math.sqrt(truth.gyro_rate) * rng.standard_normal(rates.shape)
-    return GyroSeries(
-        START_NS + np.rint(times * 1e9).astype(np.int64), rates + np.array(truth.gyro_bias) + noise
-    )
+    sigma = truth.gyro_noise * math.sqrt(truth.gyro_rate)
+    noise = sigma * rng.standard_normal(rates.shape)
+    stamps = START_NS + np.rint(times * 1e9).astype(np.int64)
+    return GyroSeries(stamps, rates + np.array(truth.gyro_bias) + noise)
 
 
 def _world(rng: np.random.Generator) -> Array:
@@ -139,14 +139,10 @@ def _world(rng: np.random.Generator) -> Array:
     azimuth = rng.uniform(-1.9, 1.9, count)
     elevation = rng.uniform(-1.0, 0.9, count)
     distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
-    direction = np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ],
-        axis=1,
-    )
+    level = np.cos(elevation)
+    x = level * np.cos(azimuth)
+    y = level * np.sin(azimuth)
+    direction = np.stack([x, y, np.sin(elevation)], axis=1)
     points = np.array([0.0, 0.0, 1.6]) + direction * distance[:, None]
     points[:, 2] = np.maximum(points[:, 2], 0.0)
     return points
@@ -156,18 +152,21 @@ def _frames(
     truth: Truth, trajectory: Trajectory, times: Array, world: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
-    view = View(
-        lambda local: center + truth.focal * local[:, :2] / local[:, 2:],
-        lambda pixels: np.column_stack([(pixels - center) / truth.focal, np.ones(len(pixels))]),
-        truth.width,
-        truth.height,
-        truth.readout_time / truth.height,
-        reference_row=0.0,
-    )
+
+    def project(local: Array) -> Array:
+        return np.asarray(center + truth.focal * local[:, :2] / local[:, 2:])
+
+    def unproject(pixels: Array) -> Array:
+        normalized = (pixels - center) / truth.focal
+        return np.column_stack([normalized, np.ones(len(pixels))])
+
+    line_delay = truth.readout_time / truth.height
+    view = View(project, unproject, truth.width, truth.height, line_delay, reference_row=0.0)
     path = FinePath(trajectory, times[0] - 0.1, times[-1] + 0.15)
-    ids = np.full(len(world), -1, dtype=np.int64)  # track of a point that is followed
-    drift = np.zeros((len(world), 2))
-    start = np.zeros(len(world))
+    count = len(world)
+    ids = np.full(count, -1, dtype=np.int64)  # track of a point that is followed
+    drift = np.zeros((count, 2))
+    start = np.zeros(count)
     next_id = 0
     frame = []
     track = []
@@ -176,7 +175,8 @@ def _frames(
         points = observe(world, path.motion_from(time), view, margin=-2.0)
         visible = np.isfinite(points).all(axis=1)
         # A track is lost now and then, even in sight.
-        ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
+        lost = rng.uniform(size=count) < 0.02
+        ids[~visible | lost] = -1
         free = truth.features - int((ids >= 0).sum())
         candidates = np.flatnonzero(visible & (ids < 0))
         new = rng.permutation(candidates)[: max(free, 0)]
@@ -187,11 +187,9 @@ def _frames(
         drift[new] = slides[:, None] * rng.normal(0.0, 80.0, (len(new), 2))
         start[new] = time
         followed = np.flatnonzero(ids >= 0)
-        measured = (
-            points[followed]
-            + drift[followed] * (time - start[followed])[:, None]
-            + truth.pixel_noise * rng.standard_normal((len(followed), 2))
-        )
+        age = (time - start[followed])[:, None]
+        noise = truth.pixel_noise * rng.standard_normal((len(followed), 2))
+        measured = points[followed] + drift[followed] * age + noise
         jumps = rng.uniform(size=len(followed)) < 0.25 * truth.outliers
         measured[jumps] += rng.uniform(-50.0, 50.0, (int(jumps.sum()), 2))
         frame.append(np.full(len(followed), index))

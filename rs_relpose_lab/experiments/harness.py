@@ -27,15 +27,18 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [list(header), *map(list, rows)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
 
-    def padded(line: Sequence[str]) -> str:
-        cells = [
-            line[0].ljust(widths[0]),
-            *(text.rjust(width) for text, width in zip(line[1:], widths[1:], strict=True)),
-        ]
-        return '| ' + ' | '.join(cells) + ' |'
+    first_width = widths[0]
 
-    rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
-    return '\n'.join([padded(lines[0]), padded(rule), *map(padded, lines[1:])]) + '\n'
+    def padded(line: Sequence[str]) -> str:
+        numbers = zip(line[1:], widths[1:], strict=True)
+        cells = [line[0].ljust(first_width)]
+        cells += [text.rjust(width) for text, width in numbers]
+        return f'| {" | ".join(cells)} |\n'
+
+    rule = ['-' * first_width]
+    rule += ['-' * (width - 1) + ':' for width in widths[1:]]
+    above = padded(lines[0]) + padded(rule)
+    return above + ''.join(padded(line) for line in lines[1:])
 
 
 def write_csv(path: Path, records: Iterable[Any]) -> None:

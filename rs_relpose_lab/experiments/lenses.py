@@ -101,9 +101,9 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         distortion=(),
     )
     camera = _distorted(camera, rng)
-    axes = Rotation.from_rotvec(
-        rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True
-    ) * Rotation.from_matrix(axis_maps()[rng.integers(24)])
+    misalignment = rng.uniform(-MISALIGNED, MISALIGNED, 3)
+    axis_map = Rotation.from_matrix(axis_maps()[rng.integers(24)])
+    axes = Rotation.from_rotvec(misalignment, degrees=True) * axis_map
     return replace(config, quat_cam_imu_xyzw=tuple(axes.as_quat().tolist())), camera
 
 
@@ -113,11 +113,13 @@ def _distorted(camera: RollingShutterCamera, rng: np.random.Generator) -> Rollin
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     center = np.array([camera.cx, camera.cy])
     shares = np.linspace(0.0, 1.0, _INVERTED_AT)
-    points = (center + shares[:, None, None] * (corners - center)).reshape(-1, 2)
+    to_corners = corners - center
+    points = (center + shares[:, None, None] * to_corners).reshape(-1, 2)
+    usual = MODELS[camera.distortion_model]
     while True:
         drawn = np.clip(rng.standard_normal(3), -_WITHIN, _WITHIN)
         by_prior = root @ drawn
-        first = np.array([rng.uniform(*MODELS[camera.distortion_model]), 0.0, 0.0])
+        first = np.array([rng.uniform(*usual), 0.0, 0.0])
         deviation = np.array([0.0, 0.0, *(first + by_prior), 0.0, 0.0])
         lens = camera.moved_lens(deviation)
         if not np.isnan(lens.unproject(points)).any():

@@ -261,12 +261,15 @@ def on_recording(
 def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
     """Error of the last position after the first 5 s are aligned, in % of the path."""
     covered = [pose for pose in live if truth.covers(pose.imu_ns)]
+    times_ns = [pose.imu_ns for pose in covered]
     places = np.array([pose.position for pose in covered])
-    true = np.array([truth.position(pose.imu_ns) for pose in covered])
-    early = [seconds_between(covered[0].imu_ns, pose.imu_ns) < _ALIGNED for pose in covered]
+    true = np.array([truth.position(time_ns) for time_ns in times_ns])
+    early = [seconds_between(times_ns[0], time_ns) < _ALIGNED for time_ns in times_ns]
     R, t, _ = offline.aligned(places[early], true[early])
-    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
-    return float(100.0 * np.linalg.norm(R @ places[-1] + t - true[-1]) / length)
+    steps = np.diff(true, axis=0)
+    length = np.linalg.norm(steps, axis=1).sum()
+    error = np.linalg.norm(R @ places[-1] + t - true[-1])
+    return float(100.0 * error / length)
 
 
 def write_report(folder: Path, paths: Sequence[PathMetrics]) -> str:

@@ -174,13 +174,18 @@ def oracle_estimate(
 
 def pose_at(origin: Start, x: Values) -> tuple[Values, Values, Values]:
     """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
-    series = _series(x[:3], np.ones(1))
-    R = np.stack(
-        [_rotate(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T], axis=1
-    )
+    turn = x[:3]
+    series = _series(turn, np.ones(1))
+    columns = [_rotate(turn, column[:, None, None], series)[:, :, 0] for column in origin.R.T]
+    R = np.stack(columns, axis=1)
     t = origin.t[:, None] + origin.tangent @ x[3:5]
     gravity = origin.gravity[:, None] + origin.gravity_tangent @ x[_GRAVITY]
-    return R, t / np.sqrt((t * t).sum(axis=0)), gravity / np.sqrt((gravity * gravity).sum(axis=0))
+    return R, _directions(t), _directions(gravity)
+
+
+def _directions(vectors: Values) -> Values:
+    """Columns (3, K) scaled to length 1; also of a complex step."""
+    return vectors / np.sqrt((vectors * vectors).sum(axis=0))
 
 
 def _sampson(
@@ -211,19 +216,16 @@ def _sampson(
     e_v1 = _dot(towards1, f1_v) - LINE_DELAY * _dot(normal, d1)
     e_u2 = _dot(towards2, f2_u)
     e_v2 = _dot(towards2, f2_v) + LINE_DELAY * _dot(normal, d2)
-    return (e / np.sqrt(e_u1 * e_u1 + e_v1 * e_v1 + e_u2 * e_u2 + e_v2 * e_v2)).T
+    gradient_square = e_u1 * e_u1 + e_v1 * e_v1 + e_u2 * e_u2 + e_v2 * e_v2
+    return (e / np.sqrt(gradient_square)).T
 
 
 def _derotated(points: Array, w: Values) -> tuple[tuple[Values, Values, Values], Array]:
     """Derotated rays (3, K, N), their derivatives by u and v, and row times (N,)."""
     tau = LINE_DELAY * points[:, 1]
-    m = np.stack(
-        [
-            (points[:, 0] - CENTRE_U) / FOCAL,
-            (points[:, 1] - CENTRE_V) / FOCAL,
-            np.ones(len(points)),
-        ]
-    )[:, None]
+    x = (points[:, 0] - CENTRE_U) / FOCAL
+    y = (points[:, 1] - CENTRE_V) / FOCAL
+    m = np.stack([x, y, np.ones(len(points))])[:, None]
     along_u = np.array([1.0, 0.0, 0.0]) / FOCAL
     along_v = np.array([0.0, 1.0, 0.0]) / FOCAL
     series = _series(w, tau)

@@ -354,9 +354,9 @@ class OmnidirectionalCamera(RollingShutterCamera):
             rho = -self.polynomial[0] * angle
             for _ in range(_MAX_STEPS):
                 depth, by_rho = self._depth(rho)
-                step = (rho * points[:, 2] - across * depth) / (
-                    points[:, 2] - across * rho * by_rho
-                )
+                residual = rho * points[:, 2] - across * depth
+                slope = points[:, 2] - across * rho * by_rho
+                step = residual / slope
                 rho = rho - step
                 if not (np.abs(step) > _SETTLED * np.abs(rho)).any():
                     break
@@ -366,7 +366,8 @@ class OmnidirectionalCamera(RollingShutterCamera):
                 & (self._depth(rho)[0] > 0.0)
                 & (points[:, 2] > 1e-9)
             )
-            scale = np.where(across > 0.0, rho / np.where(across > 0.0, across, 1.0), 0.0)
+            off_axis = across > 0.0
+            scale = np.where(off_axis, rho / np.where(off_axis, across, 1.0), 0.0)
         pixels = (points[:, :2] * scale[:, None]) @ self._stretch.T + (self.cx, self.cy)
         pixels[~observed] = np.nan
         return pixels
@@ -376,11 +377,13 @@ class OmnidirectionalCamera(RollingShutterCamera):
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         inverse = np.linalg.inv(self._stretch)
         plane = (points - (self.cx, self.cy)) @ inverse.T
-        depth, by_rho = self._depth(np.hypot(plane[:, 0], plane[:, 1]))
+        rho = np.hypot(plane[:, 0], plane[:, 1])
+        depth, by_rho = self._depth(rho)
         depth = np.where(depth > 0.0, depth, np.nan)
         normalized = plane / depth[:, None]
         # d(m / depth)/dm = (I - n (d depth/dm)) / depth, with d depth/dm = by_rho m.
-        by_plane = np.eye(2) - normalized[:, :, None] * (by_rho[:, None] * plane)[:, None, :]
+        depth_by_plane = by_rho[:, None] * plane
+        by_plane = np.eye(2) - normalized[:, :, None] * depth_by_plane[:, None, :]
         by_pixel = by_plane / depth[:, None, None] @ inverse
         return rays_with_jacobian(normalized, np.ascontiguousarray(by_pixel))
 
@@ -400,18 +403,17 @@ class OmnidirectionalCamera(RollingShutterCamera):
 
 def read_poses(folder: Path, sequence: str) -> tuple[NDArray[np.int64], Array, Rotation]:
     """Stamps [ns], positions [m] and rotations to the world (z up) of a sequence's rig."""
-    path = _first(
-        folder, f'data/ground_truth/{sequence}/pose.txt', f'ground_truth/{sequence}/pose.txt'
-    )
+    inner = f'ground_truth/{sequence}/pose.txt'
+    path = _first(folder, f'data/{inner}', inner)
     rows = list(read_rows(path, range(13), separator=None))
     stamps = np.array([row.seconds_as_nanoseconds(0) for row in rows], dtype=np.int64)
     if len(rows) < 4 or not (np.diff(stamps) > 0).all():
         raise InputError(f'{path} must hold at least 4 poses in the order of their stamps')
-    matrices = np.array([[row.real(column) for column in range(1, 13)] for row in rows]).reshape(
-        -1, 3, 4
-    )
+    values = np.array([[row.real(column) for column in range(1, 13)] for row in rows])
+    matrices = values.reshape(-1, 3, 4)
     R = matrices[:, :, :3]
-    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    squared = R @ R.transpose(0, 2, 1)
+    off = np.abs(squared - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0.0))
     if len(bad):
         raise rows[bad[0]].error('columns 2 to 13 must be a rotation and a position, row by row')

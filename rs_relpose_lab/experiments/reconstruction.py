@@ -60,13 +60,14 @@ class _Linear(NamedTuple):
 
     def poses(self, times: Array) -> tuple[Array, Array]:
         """Positions and orientations at times."""
-        share = (np.atleast_1d(times) - self.begin) / (self.end - self.begin)
+        since = np.atleast_1d(times) - self.begin
+        share = (since / (self.end - self.begin))[:, None]
         first = Rotation.from_matrix(self.R[0])
-        turn = (first.inv() * Rotation.from_matrix(self.R[1])).as_rotvec()
-        return (
-            self.positions[0] + share[:, None] * (self.positions[1] - self.positions[0]),
-            (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix(),
-        )
+        last = Rotation.from_matrix(self.R[1])
+        turn = (first.inv() * last).as_rotvec()
+        turned = first * Rotation.from_rotvec(share * turn)
+        way = self.positions[1] - self.positions[0]
+        return self.positions[0] + share * way, turned.as_matrix()
 
 
 def on_walk(config: SimulationConfig) -> RowMetrics:
@@ -108,7 +109,8 @@ def _position_error(
     _, p = rows.pose(times)
     true = simulation.states(times).position
     A, t, _ = aligned(p, true)
-    return float(np.sqrt(((p @ A.T + t - true) ** 2).sum(axis=1).mean())), A, t
+    squares = ((p @ A.T + t - true) ** 2).sum(axis=1)
+    return float(np.sqrt(squares.mean())), A, t
 
 
 def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -> float:
@@ -117,7 +119,8 @@ def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -
     true = simulation.states(times).R_world_cam
     later = np.searchsorted(times, times + round(_WITHIN * NANOSECONDS)) - 1
     steps = [np.einsum('nji,njk->nik', one, one[later]) for one in (R, true)]
-    angles = Rotation.from_matrix(np.einsum('nji,njk->nik', *steps)).magnitude()
+    differences = np.einsum('nji,njk->nik', *steps)
+    angles = Rotation.from_matrix(differences).magnitude()
     return float(np.degrees(np.sqrt((angles**2).mean())))
 
 
@@ -131,21 +134,26 @@ def _rendered(
     truth = simulation.states(stamps.ravel())
     R_true = truth.R_world_cam.reshape(*stamps.shape, 3, 3)
     p_true = truth.position.reshape(*stamps.shape, 3)
-    turns = Rotation.from_matrix(np.einsum('nji,njk->nik', R_true[:, 0], R_true[:, 2])).magnitude()
+    first_to_last = np.einsum('nji,njk->nik', R_true[:, 0], R_true[:, 2])
+    turns = Rotation.from_matrix(first_to_last).magnitude()
     ways = np.linalg.norm(p_true[:, 2] - p_true[:, 0], axis=1)
-    moving = np.flatnonzero(config.fx * (turns + ways / _DEPTH) > _LEAST_MOTION)
-    for k in np.random.default_rng(config.seed).permutation(moving)[:_RENDERED]:
+    motions = config.fx * (turns + ways / _DEPTH)
+    moving = np.flatnonzero(motions > _LEAST_MOTION)
+    order = np.random.default_rng(config.seed).permutation(moving)
+    for k in order[:_RENDERED]:
         begin, _, end = (simulation.seconds(int(at)) for at in stamps[k])
         R, p = rows.pose(stamps[k])
         true = simulation.renderer.render(begin)
-        # At the middle row, and on the whole path.
         own = R_true[k, 1] @ R[1].T
-        for i, (turn, move) in enumerate(((own, p_true[k, 1] - own @ p[1]), (A, t))):
+        at_middle_row = (own, p_true[k, 1] - own @ p[1])
+        on_whole_path = (A, t)
+        for i, (turn, move) in enumerate((at_middle_row, on_whole_path)):
             for j, places in enumerate(([0, 2], [1, 1])):
                 fake: Any = _Linear(begin, end, turn @ R[places], p[places] @ turn.T + move)
                 drawn = replace(simulation.renderer, trajectory=fake).render(begin)
                 sums[i, j] += np.abs(drawn - true).mean()
-    return float(sums[0, 0] / sums[0, 1]), float(sums[1, 0] / sums[1, 1])
+    ratios = sums[:, 0] / sums[:, 1]
+    return float(ratios[0]), float(ratios[1])
 
 
 def write_report(folder: Path, walks: Sequence[RowMetrics]) -> str:

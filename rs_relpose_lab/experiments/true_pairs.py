@@ -71,12 +71,17 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 def _pair_of(row: dict[str, str]) -> TruePair:
     places = [(i, j) for i in (1, 2, 3) for j in (1, 2, 3)]
-    R = np.array([float(row[f'r{i}{j}']) for i, j in places]).reshape(3, 3)
-    t = np.array([float(row[f't{axis}']) for axis in 'xyz'])
-    t_sigma = math.radians(float(row['sigma_t_deg']))
-    R_sigma = math.radians(float(row['sigma_r_deg'])) / math.sqrt(3.0)
-    stamps = int(row['stamp1_ns']), int(row['stamp2_ns'])
-    return TruePair(*stamps, R, t, isotropic(t_sigma, R_sigma))
+
+    def real(column: str) -> float:
+        return float(row[column])
+
+    elements = [real(f'r{i}{j}') for i, j in places]
+    R = np.array(elements).reshape(3, 3)
+    t = np.array([real(f't{axis}') for axis in 'xyz'])
+    t_sigma = math.radians(real('sigma_t_deg'))
+    R_sigma = math.radians(real('sigma_r_deg')) / math.sqrt(3.0)
+    covariance = isotropic(t_sigma, R_sigma)
+    return TruePair(int(row['stamp1_ns']), int(row['stamp2_ns']), R, t, covariance)
 
 
 # -- Path of an adjustment of all frames ----------------------------------------------------------

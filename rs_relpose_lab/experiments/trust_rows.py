@@ -103,9 +103,12 @@ def _error(quantity: str, value: float) -> Error:
 
 def _axes_rotated(rotation: Callable[[np.random.Generator], Rotation]) -> Change:
     """The IMU's own axes are rotated: ``R_wrong = R_cam_imu T``."""
-    return lambda right, rng: right.with_values(
-        quat_cam_imu_xyzw=tuple(float(v) for v in (right.R_cam_imu * rotation(rng)).as_quat())
-    )
+
+    def wrong(right: Configured, rng: np.random.Generator) -> Configured:
+        turned = right.R_cam_imu * rotation(rng)
+        return right.with_values(quat_cam_imu_xyzw=tuple(turned.as_quat().tolist()))
+
+    return wrong
 
 
 def _random_vector(rng: np.random.Generator, length: float) -> Array:
@@ -118,12 +121,13 @@ def _three_degrees(rng: np.random.Generator) -> Rotation:
 
 
 def _focal_length(factor: float) -> Change:
-    return lambda right, rng: replace(
-        right,
-        intrinsics=replace(
-            right.intrinsics, fx=factor * right.intrinsics.fx, fy=factor * right.intrinsics.fy
-        ),
-    )
+
+    def wrong(right: Configured, rng: np.random.Generator) -> Configured:
+        known = right.intrinsics
+        scaled = replace(known, fx=factor * known.fx, fy=factor * known.fy)
+        return replace(right, intrinsics=scaled)
+
+    return wrong
 
 
 def _squeezed(factor: float) -> Change:
@@ -135,23 +139,25 @@ def _squeezed(factor: float) -> Change:
 
 def _center(right: float, down: float) -> Change:
     """The configured principal point is off, as of images that were cropped."""
-    return lambda configured, rng: replace(
-        configured,
-        intrinsics=replace(
-            configured.intrinsics,
-            cx=configured.intrinsics.cx + right,
-            cy=configured.intrinsics.cy + down,
-        ),
-    )
+
+    def wrong(configured: Configured, rng: np.random.Generator) -> Configured:
+        known = configured.intrinsics
+        moved = replace(known, cx=known.cx + right, cy=known.cy + down)
+        return replace(configured, intrinsics=moved)
+
+    return wrong
 
 
 def _readout(factor: float) -> tuple[Change, Error]:
-    return (
-        lambda right, rng: right.with_values(readout_time=factor * right.values['readout_time']),
-        lambda right, rng: Injected(
-            'readout_time', np.array([(factor - 1.0) * right.values['readout_time']])
-        ),
-    )
+
+    def wrong(right: Configured, rng: np.random.Generator) -> Configured:
+        return right.with_values(readout_time=factor * right.values['readout_time'])
+
+    def error(right: Configured, rng: np.random.Generator) -> Injected:
+        off = (factor - 1.0) * right.values['readout_time']
+        return Injected('readout_time', np.array([off]))
+
+    return wrong, error
 
 
 def _reversed(right: Configured, rng: np.random.Generator) -> Configured:
@@ -251,18 +257,19 @@ def _shown(geometry: Geometry) -> Change:
 
 def _rectified(points: Array, camera: RollingShutterCamera) -> Array:
     rays = camera.unproject(points)
-    return np.asarray(rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+    normalized = rays[:, :2] / rays[:, 2:]
+    return np.asarray(normalized * (camera.fx, camera.fy) + (camera.cx, camera.cy))
 
 
 def _rectified_image(image: Gray, camera: RollingShutterCamera) -> Gray:
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.column_stack(
-        [(u.ravel() - camera.cx) / camera.fx, (v.ravel() - camera.cy) / camera.fy, np.ones(u.size)]
-    )
-    source = camera.project(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
-    return np.asarray(
-        cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR), dtype=np.uint8
-    )
+    x = (u.ravel() - camera.cx) / camera.fx
+    y = (v.ravel() - camera.cy) / camera.fy
+    rays = np.column_stack([x, y, np.ones(u.size)])
+    sources = camera.project(rays).astype(np.float32)
+    columns, rows = sources.T.reshape(2, camera.height, camera.width)
+    rectified = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
+    return np.asarray(rectified, dtype=np.uint8)
 
 
 def _reversed_order(columns: bool, rows: bool) -> Geometry:
@@ -426,7 +433,8 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> tuple[Arra
     The latter in sigmas.
     """
     unknowns = _UNKNOWNS + _FREE
-    residuals = _Residuals(pair, camera)(_STEP * np.eye(unknowns + 1, unknowns, -1))
+    at_truth_and_steps = _STEP * np.eye(unknowns + 1, unknowns, -1)
+    residuals = _Residuals(pair, camera)(at_truth_and_steps)
     jacobian = (residuals[1:] - residuals[0]).T / _STEP
     by_x = jacobian[:, :_UNKNOWNS]
     by_c = jacobian[:, _UNKNOWNS:]
@@ -434,15 +442,13 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> tuple[Arra
     mixed = by_x.T @ by_c
     # By the images alone, without the last three residuals, which are the gyro's.
     by_images = by_x[:-3].T @ by_x[:-3]
-    information = np.linalg.inv(np.linalg.inv(by_images)[:3, :3])
+    covariance = np.linalg.inv(by_images)
+    information = np.linalg.inv(covariance[:3, :3])
     rotation = Rotation.from_matrix(pair.R).as_rotvec()
-    length = math.sqrt(float(rotation @ information @ rotation)) / max(
-        float(np.linalg.norm(rotation)), 1e-9
-    )
-    return (
-        by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
-        length**2 * np.outer(rotation, rotation),
-    )
+    angle = max(float(np.linalg.norm(rotation)), 1e-9)
+    length = math.sqrt(float(rotation @ information @ rotation)) / angle
+    reduced = by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed)
+    return reduced, length**2 * np.outer(rotation, rotation)
 
 
 class _Residuals:
@@ -513,8 +519,10 @@ class _Residuals:
         pair = self._pair
         place1, ray1 = self._row(pair.pixels1, pair.rates1, velocities[:, 0], c)
         place2, ray2 = self._row(pair.pixels2, pair.rates2, velocities[:, 1], c)
-        across = np.cross(ray1, ray2 @ np.swapaxes(R, 1, 2))
-        return np.asarray(((t[:, None] + place2 - place1) * across).sum(axis=2))
+        ray2_in_1 = ray2 @ np.swapaxes(R, 1, 2)
+        normal = np.cross(ray1, ray2_in_1)
+        baseline = t[:, None] + place2 - place1
+        return np.asarray((baseline * normal).sum(axis=2))
 
     def _row(self, pixels: Array, rates: Array, velocity: Array, c: Array) -> tuple[Array, Array]:
         """Displacement since the middle row (K, N, 3), and rays (K, N, 3) derotated to it."""
@@ -524,10 +532,11 @@ class _Residuals:
         times = (readout * away / camera.height)[..., None]
         # The gyro's rate with c; its change within the offset is in the rotation between the
         # frames.
-        axes, bias, scale = (
-            c[:, None, PLACES[name]] for name in ('axes', 'gyro_bias', 'gyro_scale')
-        )
-        angles = times * ((1.0 + scale) * (rates + np.cross(axes, rates)) - bias)
+        axes = c[:, None, PLACES['axes']]
+        bias = c[:, None, PLACES['gyro_bias']]
+        scale = c[:, None, PLACES['gyro_scale']]
+        turned_rates = rates + np.cross(axes, rates)
+        angles = times * ((1.0 + scale) * turned_rates - bias)
         rays = self._rays(pixels, c)
         once = np.cross(angles, rays)
         return times * velocity[:, None], rays + once + 0.5 * np.cross(angles, once)
@@ -559,9 +568,9 @@ class _Residuals:
     def _at_truth(self) -> Array:
         pair = self._pair
         velocities = np.stack([pair.t, pair.t]) / pair.interval
-        return np.asarray(
-            self._matches(pair.R[None], pair.t[None], velocities[None], np.zeros((1, _FREE)))[0]
-        )
+        right = np.zeros((1, _FREE))
+        residuals = self._matches(pair.R[None], pair.t[None], velocities[None], right)
+        return np.asarray(residuals[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -583,10 +592,9 @@ class InformativeMotion:
             each = quarter * np.linalg.eigvalsh(self.rotations)[:, 2]
             so_far = quarter * np.linalg.eigvalsh(np.cumsum(self.rotations, axis=0))[:, 1]
         else:
-            each, so_far = (
-                np.array([_squared_error(injected, quantities) for quantities in information])
-                for information in (self.quantities, np.cumsum(self.quantities, axis=0))
-            )
+            total = np.cumsum(self.quantities, axis=0)
+            each = np.array([_squared_error(injected, one) for one in self.quantities])
+            so_far = np.array([_squared_error(injected, one) for one in total])
         return np.asarray((so_far >= INFORMATIVE**2) & (each >= _LEAST_PART * INFORMATIVE**2))
 
 

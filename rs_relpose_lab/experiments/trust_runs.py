@@ -223,24 +223,22 @@ class SimulatedTracker:
         rows = np.searchsorted(known.ids[frame], self._corners)
         rows = np.minimum(rows, len(known.ids[frame]) - 1)
         way = known.travelled[frame] - known.travelled[self._reference]
-        places = (
-            known.pixels[frame][rows]
-            + self._offsets
-            + known.errors.white * known.noise[frame][rows]
-            + min(way / known.errors.settled, 1.0) * known.slips[self._corners]
-            + way * known.slides[self._corners]
-        )
+        white = known.errors.white * known.noise[frame][rows]
+        settled = min(way / known.errors.settled, 1.0)
+        slip = settled * known.slips[self._corners]
+        slide = way * known.slides[self._corners]
+        places = known.pixels[frame][rows] + self._offsets + white + slip + slide
         points = self._published(places)
-        expected = (
-            points
-            if predicted is None
-            else np.where(np.isfinite(predicted), predicted, self._matches.points2)
-        )
+        before = self._matches.points2
+        expected = points
+        if predicted is not None:
+            expected = np.where(np.isfinite(predicted), predicted, before)
         reached = np.linalg.norm(points - expected, axis=1) < _REACH
         if np.count_nonzero(~reached) > _MOST_LOST * len(reached):
             # Then `KltTracker` searches at the previous positions.
-            reached |= np.linalg.norm(points - self._matches.points2, axis=1) < _REACH
-        good = (known.ids[frame][rows] == self._corners) & self._inside(points) & reached
+            reached |= np.linalg.norm(points - before, axis=1) < _REACH
+        is_there = known.ids[frame][rows] == self._corners
+        good = is_there & self._inside(points) & reached
         self._matches = self._matches.followed(points).kept(good)
         self._corners = self._corners[good]
         self._offsets = self._offsets[good]
@@ -260,7 +258,9 @@ class SimulatedTracker:
         places = self._places[kept]
         free = ~np.isin(ids, corners) & self._inside(self._published(pixels))
         # Any of them, but the same ones in every run.
-        order = np.argsort(ids[free] * _SCATTER % 2**32)[: max(self._most - len(corners), 0)]
+        scattered = ids[free] * _SCATTER % 2**32
+        wanted = max(self._most - len(corners), 0)
+        order = np.argsort(scattered)[:wanted]
         new = ids[free][order]
         new_places = pixels[free][order]
         self._corners = np.concatenate([corners, new])
@@ -268,22 +268,18 @@ class SimulatedTracker:
         rows = np.searchsorted(ids, self._corners)
         self._offsets = self._places - pixels[rows]
         points = self._published(self._places)
-        self._matches = Matches(
-            np.concatenate([self._matches.track_ids[kept], self._ids.take(len(new))]),
-            np.stack([points, points]),
-            np.ones(len(points)),
-        )
+        new_tracks = self._ids.take(len(new))
+        tracks = np.concatenate([self._matches.track_ids[kept], new_tracks])
+        self._matches = Matches(tracks, np.stack([points, points]), np.ones(len(points)))
         self._started = len(points)
         self._reference = self._frame
 
     def _inside(self, points: Array) -> NDArray[np.bool_]:
         """Which points (N, 2) of the published image are clear of its border."""
         height, width = self._shape
-        return np.asarray(
-            ((points >= _BORDER) & (points <= (width - 1 - _BORDER, height - 1 - _BORDER))).all(
-                axis=1
-            )
-        )
+        last = (width - 1 - _BORDER, height - 1 - _BORDER)
+        inside = (points >= _BORDER) & (points <= last)
+        return np.asarray(inside.all(axis=1))
 
 
 # -- runs of a recording ----------------------------------------------------------------------

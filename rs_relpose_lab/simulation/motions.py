@@ -170,52 +170,53 @@ def _walk(rng: np.random.Generator, times: Array, levels: _Levels, speed: float)
             error = math.remainder(homewards - heading, 2 * math.pi)
             turn_rate = math.radians(110.0) * math.tanh(2.0 * error)
         heading += CONTROL_SPACING * gait * turn_rate
-        along = (
-            levels.travel[k]
-            * speed
-            * (1.0 + 0.1 * gait * math.sin(2 * math.pi * 0.4 * time + swell))
-        )
+        swelling = math.sin(2 * math.pi * 0.4 * time + swell)
+        along = levels.travel[k] * speed * (1.0 + 0.1 * gait * swelling)
         across = gait * 0.12 * math.cos(math.pi * _STEP_FREQUENCY * time + stride)
         # Two centimetres of bobbing, held near eye height.
-        climb = gait * (
-            0.02
-            * 2
-            * math.pi
-            * _STEP_FREQUENCY
-            * math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
-            + 0.8 * (EYE_HEIGHT - position[2])
-        )
+        bobbing = math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
+        fastest = 0.02 * 2 * math.pi * _STEP_FREQUENCY
+        climb = gait * (fastest * bobbing + 0.8 * (EYE_HEIGHT - position[2]))
         cosine = math.cos(heading)
         sine = math.sin(heading)
-        position = position + CONTROL_SPACING * np.array(
-            [along * cosine - across * sine, along * sine + across * cosine, climb]
-        )
-    # Clear of what stands around: the middle of the walk is the middle of the scene.
-    positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
+        forward = along * cosine - across * sine
+        left = along * sine + across * cosine
+        position = position + CONTROL_SPACING * np.array([forward, left, climb])
+    _centre(positions)
     return positions
+
+
+def _centre(positions: Array) -> None:
+    """Move control points (K, 3) so that the middle of the path is the middle of the scene.
+
+    The path is then clear of what stands around.
+    """
+    on_ground = positions[:, :2]
+    on_ground -= (on_ground.min(axis=0) + on_ground.max(axis=0)) / 2
 
 
 def _angles(
     rng: np.random.Generator, times: Array, levels: _Levels, rotation_rate: float
 ) -> Array:
     """Control points (K, 3) of yaw, pitch and roll."""
-    amplitudes = np.array([amplitude for amplitude, _, _ in _ROTATIONS])
-    amplitudes = np.radians(amplitudes * rng.uniform(0.7, 1.3, len(_ROTATIONS)))
-    frequencies = np.array([frequency for _, frequency, _ in _ROTATIONS])
-    frequencies = frequencies * rng.uniform(0.85, 1.15, len(_ROTATIONS))
-    phases = rng.uniform(0.0, 2 * math.pi, len(_ROTATIONS))
-    rms = math.sqrt(float(((amplitudes * 2 * math.pi * frequencies) ** 2).sum() / 2))
+    count = len(_ROTATIONS)
+    usual_amplitudes, usual_frequencies, axes = zip(*_ROTATIONS, strict=True)
+    amplitudes = np.radians(np.array(usual_amplitudes) * rng.uniform(0.7, 1.3, count))
+    frequencies = np.array(usual_frequencies) * rng.uniform(0.85, 1.15, count)
+    phases = rng.uniform(0.0, 2 * math.pi, count)
+    rates = amplitudes * 2 * math.pi * frequencies
+    rms = math.sqrt(float((rates**2).sum() / 2))
     amplitudes *= rotation_rate / rms
     # The sinusoids run on a clock of their own that stops without rotation.
     clock = CONTROL_SPACING * np.concatenate([[0.0], np.cumsum(levels.rotation[:-1])])
     angles = np.zeros((len(times), 3))
-    for amplitude, frequency, phase, (_, _, axis) in zip(
-        amplitudes, frequencies, phases, _ROTATIONS, strict=True
-    ):
+    sinusoids = zip(axes, amplitudes, frequencies, phases, strict=True)
+    for axis, amplitude, frequency, phase in sinusoids:
         angles[:, axis] += amplitude * np.sin(2 * math.pi * frequency * clock + phase)
     # Pans to and fro, so that the view stays where the scene is.
     pan_rate = rng.choice((-1.0, 1.0)) * math.radians(rng.uniform(8.0, 15.0))
-    starts = np.flatnonzero((levels.panning[1:] > 0) & (levels.panning[:-1] == 0))
+    begins = (levels.panning[1:] > 0) & (levels.panning[:-1] == 0)
+    starts = np.flatnonzero(begins)
     signs = (-1.0) ** np.searchsorted(starts, np.arange(len(times)))
     pan = CONTROL_SPACING * pan_rate * signs * levels.panning
     angles[:, 0] += np.concatenate([[0.0], np.cumsum(pan[:-1])])
@@ -259,20 +260,24 @@ def vehicle(rng: np.random.Generator, start: float, end: float, *, speed: float)
     road = speeds / speed
     pitch, roll, heave = (_spring(rng.standard_normal(count) * road) for _ in range(3))
     positions[:, 2] += _HEAVE * heave
-    angles = np.column_stack(
-        [yaw, _ROCKING * pitch - _LEAN * acceleration, _ROCKING * roll + _LEAN * sideways]
-    )
+    nodding = _ROCKING * pitch - _LEAN * acceleration
+    rolling = _ROCKING * roll + _LEAN * sideways
+    angles = np.column_stack([yaw, nodding, rolling])
     angles[:, 1] += math.radians(rng.uniform(-1.0, 4.0))
     return Trajectory(positions, angles, float(times[0]), CONTROL_SPACING, ())
 
 
 def _throttle(rng: np.random.Generator, times: Array) -> Array:
     """Share (K,) of the full speed: swells, and ramps down to a stop and up again."""
-    swell = 1.0 - 0.2 * (1.0 + np.sin(2 * math.pi * 0.13 * times + rng.uniform(0, 2 * math.pi)))
-    since = (times + rng.uniform(-1.5, 0.0)) % _STOP_EVERY - 0.6 * _STOP_EVERY
+    phase = rng.uniform(0, 2 * math.pi)
+    swell = 1.0 - 0.2 * (1.0 + np.sin(2 * math.pi * 0.13 * times + phase))
+    delay = rng.uniform(-1.5, 0.0)
+    since = (times + delay) % _STOP_EVERY - 0.6 * _STOP_EVERY
     inside = np.clip(since / _STOP, 0.0, 1.0)
+    from_middle = 3.0 * np.abs(inside - 0.5)
+    ramp = np.clip(from_middle - 0.5, 0.0, 1.0)
     # 1 outside of the stop, 0 in its middle third, cosines between.
-    stop = 0.5 - 0.5 * np.cos(math.pi * np.clip(3.0 * np.abs(inside - 0.5) - 0.5, 0.0, 1.0))
+    stop = 0.5 - 0.5 * np.cos(math.pi * ramp)
     return np.asarray(swell * stop)
 
 
@@ -281,10 +286,9 @@ def _drive(
 ) -> tuple[Array, Array]:
     """Control points (K, 3) of the position and (K,) of the yaw."""
     phases = rng.uniform(0.0, 2 * math.pi, 2)
-    wander = _WANDER_RATE * (
-        np.sin(2 * math.pi * 0.11 * times + phases[0])
-        + np.sin(2 * math.pi * 0.29 * times + phases[1])
-    )
+    slow = np.sin(2 * math.pi * 0.11 * times + phases[0])
+    fast = np.sin(2 * math.pi * 0.29 * times + phases[1])
+    wander = _WANDER_RATE * (slow + fast)
     position = np.array([*rng.uniform(-1.0, 1.0, 2), _ROBOT_HEIGHT])
     heading = rng.uniform(-math.pi, math.pi)
     steering = 0.0
@@ -295,16 +299,14 @@ def _drive(
         wanted = wander[k]
         if math.hypot(position[0], position[1]) > _ARENA_RADIUS:
             homewards = math.atan2(-position[1], -position[0])
-            wanted = _HOMING_RATE * math.tanh(
-                2.0 * math.remainder(homewards - heading, 2 * math.pi)
-            )
+            error = math.remainder(homewards - heading, 2 * math.pi)
+            wanted = _HOMING_RATE * math.tanh(2.0 * error)
         # The wheels need 0.4 s to turn, and a robot that stands does not.
         steering += CONTROL_SPACING / 0.4 * (wanted - steering)
         heading += CONTROL_SPACING * steering * driven / full
-        position = position + CONTROL_SPACING * driven * np.array(
-            [math.cos(heading), math.sin(heading), 0.0]
-        )
-    positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
+        direction = np.array([math.cos(heading), math.sin(heading), 0.0])
+        position = position + CONTROL_SPACING * driven * direction
+    _centre(positions)
     return positions, yaw
 
 

@@ -83,15 +83,14 @@ class Renderer:
         """Number of times at which the exposure of a row is sampled."""
         if not self.exposure_time:
             return 1
-        (start, end), (R_start, R_end) = self.trajectory.poses(
-            reference_time + self.exposure_time * np.array([-0.5, 0.5])
-        )
-        corner = (self.camera.width - 1, self.camera.height - 1)
-        world, _ = self.locate(
-            reference_time,
-            np.stack(np.meshgrid(*(np.linspace(0.0, last, 9) for last in corner)), axis=-1),
-        )
-        nearest = np.nanmin(np.linalg.norm(world - start, axis=1), initial=np.inf)
+        ends = reference_time + self.exposure_time * np.array([-0.5, 0.5])
+        (start, end), (R_start, R_end) = self.trajectory.poses(ends)
+        columns = np.linspace(0.0, self.camera.width - 1, 9)
+        rows = np.linspace(0.0, self.camera.height - 1, 9)
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+        world, _ = self.locate(reference_time, grid)
+        distances = np.linalg.norm(world - start, axis=1)
+        nearest = np.nanmin(distances, initial=np.inf)
         angle = Rotation.from_matrix(R_start.T @ R_end).magnitude()
         motion = self.camera.fx * (angle + np.linalg.norm(end - start) / nearest)
         return max(1, math.ceil(motion / _EXPOSURE_STEP))
@@ -99,10 +98,10 @@ class Renderer:
     def _at_once(self, reference_time: float) -> NDArray[np.float32]:
         """Image of rows that are exposed for no time, row by row of the sensor."""
         rows = np.arange(self.camera.row_count)
-        positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
-        exposure = _Exposure(
-            self._rays, self._tile_angles, positions, rotations, 1.0 / self.camera.fx
-        )
+        times = reference_time + self.camera.row_times(rows)
+        positions, rotations = self.trajectory.poses(times)
+        pixel_angle = 1.0 / self.camera.fx
+        exposure = _Exposure(self._rays, self._tile_angles, positions, rotations, pixel_angle)
         shape = self._rays.shape[:2]
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
@@ -162,9 +161,10 @@ def _tile_angles(rays: Array) -> Array:
         tile = rays[:, start : start + _TILE]
         middle = tile[:, tile.shape[1] // 2]
         cosine = np.einsum('hwi,hi->hw', tile, middle).min(axis=1)
+        half_angle = np.arccos(np.minimum(cosine, 1.0))
         # A margin of two pixels for the samples around an outline.
         pixel = np.linalg.norm(tile[:, 1] - tile[:, 0], axis=1) if tile.shape[1] > 1 else 0.01
-        angles[:, i] = np.arccos(np.minimum(cosine, 1.0)) + 2.0 * pixel
+        angles[:, i] = half_angle + 2.0 * pixel
     return angles
 
 
@@ -212,51 +212,50 @@ def _rotated(rotation, x, y, z):  # type: ignore[no-untyped-def]
 @_jit
 def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
     """Surfaces that face `position`; fills `faces` and returns their number."""
-    corners = scene.corners
-    across = scene.across
-    down = scene.down
-    sizes = scene.sizes
     count = 0
-    for s in range(len(corners)):
-        i = count
-        faces[i, _NORMAL] = down[s, 1] * across[s, 2] - down[s, 2] * across[s, 1]
-        faces[i, _NORMAL + 1] = down[s, 2] * across[s, 0] - down[s, 0] * across[s, 2]
-        faces[i, _NORMAL + 2] = down[s, 0] * across[s, 1] - down[s, 1] * across[s, 0]
-        x = position[0] - corners[s, 0]
-        y = position[1] - corners[s, 1]
-        z = position[2] - corners[s, 2]
-        faces[i, _HEIGHT] = _dot(x, y, z, faces, i, _NORMAL)
-        if faces[i, _HEIGHT] <= 0.0:
-            continue
-        for k in range(3):
-            faces[i, _ACROSS + k] = across[s, k]
-            faces[i, _DOWN + k] = down[s, k]
-            faces[i, _TOWARDS + k] = (
-                corners[s, k]
-                - position[k]
-                + 0.5 * (sizes[s, 0] * across[s, k] + sizes[s, 1] * down[s, k])
-            )
-        faces[i, _A] = _dot(x, y, z, faces, i, _ACROSS)
-        faces[i, _B] = _dot(x, y, z, faces, i, _DOWN)
-        faces[i, _SIZE] = sizes[s, 0]
-        faces[i, _SIZE + 1] = sizes[s, 1]
-        faces[i, _INDEX] = s
-        distance = math.sqrt(
-            _dot(
-                faces[i, _TOWARDS],
-                faces[i, _TOWARDS + 1],
-                faces[i, _TOWARDS + 2],
-                faces,
-                i,
-                _TOWARDS,
-            )
-        )
-        radius = 0.5 * math.sqrt(sizes[s, 0] ** 2 + sizes[s, 1] ** 2)
-        faces[i, _ANGLE] = math.asin(radius / distance) if radius < distance else math.pi
-        for k in range(3):
-            faces[i, _TOWARDS + k] /= max(distance, 1e-9)
-        count += 1
+    for s in range(len(scene.corners)):
+        if _write_face(position, scene, s, faces, count):
+            count += 1
     return count
+
+
+@_inline
+def _write_face(position, scene, s, faces, i):  # type: ignore[no-untyped-def]
+    """Write surface s into row i of `faces`; returns whether it faces `position`."""
+    corner = scene.corners[s]
+    across = scene.across[s]
+    down = scene.down[s]
+    width = scene.sizes[s, 0]
+    height = scene.sizes[s, 1]
+    faces[i, _NORMAL] = down[1] * across[2] - down[2] * across[1]
+    faces[i, _NORMAL + 1] = down[2] * across[0] - down[0] * across[2]
+    faces[i, _NORMAL + 2] = down[0] * across[1] - down[1] * across[0]
+    x = position[0] - corner[0]
+    y = position[1] - corner[1]
+    z = position[2] - corner[2]
+    above = _dot(x, y, z, faces, i, _NORMAL)
+    faces[i, _HEIGHT] = above
+    if above <= 0.0:
+        return False
+    for k in range(3):
+        faces[i, _ACROSS + k] = across[k]
+        faces[i, _DOWN + k] = down[k]
+        half = 0.5 * (width * across[k] + height * down[k])
+        faces[i, _TOWARDS + k] = corner[k] - position[k] + half
+    faces[i, _A] = _dot(x, y, z, faces, i, _ACROSS)
+    faces[i, _B] = _dot(x, y, z, faces, i, _DOWN)
+    faces[i, _SIZE] = width
+    faces[i, _SIZE + 1] = height
+    faces[i, _INDEX] = s
+    x = faces[i, _TOWARDS]
+    y = faces[i, _TOWARDS + 1]
+    z = faces[i, _TOWARDS + 2]
+    distance = math.sqrt(_dot(x, y, z, faces, i, _TOWARDS))
+    radius = 0.5 * math.sqrt(width**2 + height**2)
+    faces[i, _ANGLE] = math.asin(radius / distance) if radius < distance else math.pi
+    for k in range(3):
+        faces[i, _TOWARDS + k] /= max(distance, 1e-9)
+    return True
 
 
 @_jit
@@ -270,6 +269,17 @@ def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):  # type: i
             chosen[count] = i
             count += 1
     return count
+
+
+@_inline
+def _faces_of_tile(v, tile, exposure, faces, face_count, chosen):  # type: ignore[no-untyped-def]
+    """`_shortlist` for a tile of row v, by the cone around the tile's middle ray."""
+    rays = exposure.rays
+    start = tile * _TILE
+    end = min(start + _TILE, rays.shape[1])
+    middle = rays[v, start + (end - start) // 2]
+    half_angle = exposure.tile_angles[v, tile]
+    return _shortlist(exposure.rotations[v], middle, half_angle, faces, face_count, chosen)
 
 
 @_inline
@@ -384,16 +394,9 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
         rotation = rotations[v]
         face_count = _find_faces(positions[v], scene, faces)
         for tile in range(tile_angles.shape[1]):
+            count = _faces_of_tile(v, tile, exposure, faces, face_count, chosen)
             start = tile * _TILE
             end = min(start + _TILE, width)
-            count = _shortlist(
-                rotation,
-                rays[v, start + (end - start) // 2],
-                tile_angles[v, tile],
-                faces,
-                face_count,
-                chosen,
-            )
             for u in range(start, end):
                 x, y, z = _rotated(rotation, rays[v, u, 0], rays[v, u, 1], rays[v, u, 2])
                 hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
@@ -410,7 +413,7 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
 @_jit
 def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-untyped-def]
     """Replace pixels on outlines by the mean of samples within them, at their row's time."""
-    rays, tile_angles, positions, rotations, pixel_angle = exposure
+    rays, _, positions, rotations, pixel_angle = exposure
     height, width = image.shape
     faces = np.empty((len(scene.corners) + 1, _FACE_COLUMNS))
     chosen = np.empty(len(scene.corners), dtype=np.int64)
@@ -437,16 +440,7 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
                 face_count = _find_faces(positions[v], scene, faces)
             tile = u // _TILE
             if tile != listed:
-                start = tile * _TILE
-                end = min(start + _TILE, width)
-                count = _shortlist(
-                    rotation,
-                    rays[v, start + (end - start) // 2],
-                    tile_angles[v, tile],
-                    faces,
-                    face_count,
-                    chosen,
-                )
+                count = _faces_of_tile(v, tile, exposure, faces, face_count, chosen)
                 listed = tile
             total = 0.0
             for i in range(samples):
@@ -454,11 +448,9 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
                 for j in range(samples):
                     du = ((j + 0.5) / samples - 0.5) / max(right - left, 1)
                     for k in range(3):
-                        ray[k] = (
-                            rays[v, u, k]
-                            + du * (rays[v, right, k] - rays[v, left, k])
-                            + dv * (rays[below, u, k] - rays[above, u, k])
-                        )
+                        along_row = rays[v, right, k] - rays[v, left, k]
+                        along_column = rays[below, u, k] - rays[above, u, k]
+                        ray[k] = rays[v, u, k] + du * along_row + dv * along_column
                     x, y, z = _rotated(rotation, ray[0], ray[1], ray[2])
                     hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
                     if hit < 0:

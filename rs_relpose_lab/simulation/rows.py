@@ -89,24 +89,24 @@ def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Ar
         appears = pixels[:, view.axis]
         change = rows - before
         moved = np.abs(change) > _SETTLED_ROWS
-        slope = np.where(moved, (appears - projected) / np.where(moved, change, 1.0), slope)
+        secant = (appears - projected) / np.where(moved, change, 1.0)
+        slope = np.where(moved, secant, slope)
         slow = np.abs(slope) < 1.0
         settled = np.abs(appears - rows) < _SETTLED_ROWS
         observed[left[settled & slow]] = pixels[settled & slow]
         # From the last of those rows it is still further outside: it appears in no row.
-        beyond = (rows <= -view.rows) & (appears < rows) | (rows >= 2 * view.rows) & (
-            appears > rows
-        )
-        again = ~settled & ~beyond & np.isfinite(appears)
+        beyond_first = (rows <= -view.rows) & (appears < rows)
+        beyond_last = (rows >= 2 * view.rows) & (appears > rows)
+        again = ~settled & ~beyond_first & ~beyond_last & np.isfinite(appears)
         left = left[again]
         before = rows[again]
         projected = appears[again]
         slope = slope[again]
-        rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
-    inside = (
-        (observed >= -margin) & (observed <= np.array([view.width - 1, view.height - 1]) + margin)
-    ).all(axis=1)
-    observed[~inside] = np.nan
+        divisors = np.where(slow[again], 1.0 - slope, 1.0)
+        rows = before + (projected - before) / divisors
+    last = np.array([view.width - 1, view.height - 1])
+    inside = (observed >= -margin) & (observed <= last + margin)
+    observed[~inside.all(axis=1)] = np.nan
     return observed
 
 

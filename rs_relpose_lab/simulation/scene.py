@@ -73,10 +73,9 @@ def _draw_panels(rng: np.random.Generator, canvas: NDArray[np.uint8], *, amplitu
         x, y, w, h = pending.pop()
         longer = max(w, h)
         # Large panels are always divided, small ones seldom.
-        keep = longer < 2 * _SMALLEST_PANEL or (
-            longer < 0.45 * max(width, height) and rng.random() < 0.25
-        )
-        if keep:
+        is_smallest = longer < 2 * _SMALLEST_PANEL
+        is_large = longer >= 0.45 * max(width, height)
+        if is_smallest or (not is_large and rng.random() < 0.25):
             gray = int(128 + rng.integers(-amplitude, amplitude + 1))
             canvas[y : y + h, x : x + w] = gray
             joint = 1 + min(w, h) // 40
@@ -95,10 +94,7 @@ def _draw_shapes(rng: np.random.Generator, canvas: NDArray[np.uint8], *, density
     height, width = canvas.shape
     count = math.ceil(density * height * width / _TEXELS_PER_SHAPE)
     largest = max(0.35 * min(canvas.shape), 2 * _SMALLEST_SHAPE)
-    # Sizes with density 1 / size^2.5: large ones cover more than small ones do.
-    quantile = rng.random(count)
-    sizes = ((1 - quantile) * _SMALLEST_SHAPE**-1.5 + quantile * largest**-1.5) ** (-1 / 1.5)
-    sizes = np.sort(sizes)[::-1]
+    sizes = np.sort(_sizes(rng.random(count), largest))[::-1]
     centres = rng.random((count, 2)) * (width, height)
     grays = rng.integers(58, 199, count).tolist()
     aspects = rng.uniform(0.35, 1.0, count)
@@ -112,30 +108,29 @@ def _draw_shapes(rng: np.random.Generator, canvas: NDArray[np.uint8], *, density
     around = 2 * math.pi * (np.arange(4) + skews) / corners[:, None]
     x = 0.6 * sizes[:, None] * np.cos(around)
     y = 0.6 * (sizes * aspects)[:, None] * np.sin(around)
-    outlines = np.stack(
-        [cosines[:, None] * x - sines[:, None] * y, sines[:, None] * x + cosines[:, None] * y],
-        axis=2,
-    )
+    outline_x = cosines[:, None] * x - sines[:, None] * y
+    outline_y = sines[:, None] * x + cosines[:, None] * y
+    outlines = np.stack([outline_x, outline_y], axis=2)
     polygons = _fixed(outlines + centres[:, None])
     middles = _fixed(centres).tolist()
-    axes = _fixed(0.5 * sizes[:, None] * np.stack([np.ones(count), aspects], axis=1)).tolist()
+    shares = np.stack([np.ones(count), aspects], axis=1)
+    axes = _fixed(0.5 * sizes[:, None] * shares).tolist()
     degrees = np.degrees(angles).tolist()
+    smooth = {'lineType': cv2.LINE_AA, 'shift': _SHIFT}
     for i in range(count):
         if kinds[i] == 0:
             cv2.ellipse(
-                canvas,
-                middles[i],
-                axes[i],
-                degrees[i],
-                0.0,
-                360.0,
-                grays[i],
-                -1,
-                cv2.LINE_AA,
-                _SHIFT,
+                canvas, middles[i], axes[i], degrees[i], 0.0, 360.0, grays[i], -1, **smooth
             )
         else:
-            cv2.fillConvexPoly(canvas, polygons[i, : corners[i]], grays[i], cv2.LINE_AA, _SHIFT)
+            cv2.fillConvexPoly(canvas, polygons[i, : corners[i]], grays[i], **smooth)
+
+
+def _sizes(quantiles: Array, largest: float) -> Array:
+    """Sizes (N,) with density 1 / size^2.5: large shapes cover more than small ones do."""
+    of_smallest = (1 - quantiles) * _SMALLEST_SHAPE**-1.5
+    of_largest = quantiles * largest**-1.5
+    return np.asarray((of_smallest + of_largest) ** (-1 / 1.5))
 
 
 # Fractional bits of OpenCV's drawing coordinates.
@@ -331,20 +326,26 @@ class _Builder:
         distance = max(_distance(corner, across, down, width, height), nearest)
         texel = _TEXELS_PER_FOOTPRINT / self._focal_length * distance
         shape = (max(4, math.ceil(height / texel)), max(4, math.ceil(width / texel)))
-        return Surface(
-            corner, across, down, width, height, make_texture(self._rng, shape, contrast=contrast)
-        )
+        texture = make_texture(self._rng, shape, contrast=contrast)
+        return Surface(corner, across, down, width, height, texture)
 
     def room(
         self, x0: float, x1: float, y0: float, y1: float, height: float
     ) -> Iterator[Surface | None]:
         """Floor, ceiling and four walls, from inside."""
+        forward = (1, 0, 0)
+        back = (-1, 0, 0)
+        left = (0, 1, 0)
+        right = (0, -1, 0)
+        down = (0, 0, -1)
+        length = x1 - x0
+        width = y1 - y0
         yield self.floor(x0, x1, y0, y1)
-        yield self.surface((x0, y1, height), (0, -1, 0), (1, 0, 0), y1 - y0, x1 - x0, 0.6)
-        yield self.surface((x1, y1, height), (0, -1, 0), (0, 0, -1), y1 - y0, height)
-        yield self.surface((x0, y0, height), (0, 1, 0), (0, 0, -1), y1 - y0, height)
-        yield self.surface((x0, y1, height), (1, 0, 0), (0, 0, -1), x1 - x0, height)
-        yield self.surface((x1, y0, height), (-1, 0, 0), (0, 0, -1), x1 - x0, height)
+        yield self.surface((x0, y1, height), right, forward, width, length, 0.6)
+        yield self.surface((x1, y1, height), right, down, width, height)
+        yield self.surface((x0, y0, height), left, down, width, height)
+        yield self.surface((x0, y1, height), forward, down, length, height)
+        yield self.surface((x1, y0, height), back, down, length, height)
 
     def floor(self, x0: float, x1: float, y0: float, y1: float) -> Surface | None:
         """The ground, viewed at a slant."""
@@ -387,13 +388,8 @@ class _Builder:
         ):
             corner = middle + depth * outward - breadth * right + half[2] * up
             yield self.surface(corner, right, -up, 2 * breadth, 2 * half[2])
-        yield self.surface(
-            middle + half[0] * forward + half[1] * left + half[2] * up,
-            -left,
-            -forward,
-            2 * half[1],
-            2 * half[0],
-        )
+        corner_of_top = middle + half[0] * forward + half[1] * left + half[2] * up
+        yield self.surface(corner_of_top, -left, -forward, 2 * half[1], 2 * half[0])
 
 
 def _distance(corner: Array, across: Array, down: Array, width: float, height: float) -> float:

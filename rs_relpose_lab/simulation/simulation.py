@@ -40,9 +40,8 @@ class ImuModel:
         lever = np.broadcast_to(np.asarray(self.lever_arm, dtype=np.float64), w.shape)
         # a_imu = a + R (dw x l + w x (w x l)), the rigid body's other point.
         rotation = np.cross(dw, lever) + np.cross(w, np.cross(w, lever))
-        force = (
-            np.einsum('nji,nj->ni', states.R_world_cam, states.acceleration - GRAVITY) + rotation
-        )
+        free_of_gravity = states.acceleration - GRAVITY
+        force = np.einsum('nji,nj->ni', states.R_world_cam, free_of_gravity) + rotation
         gyro = w @ self.R_cam_imu + np.asarray(self.gyro_bias)
         accel = force @ self.R_cam_imu + np.asarray(self.accel_bias)
         gyro = gyro + self.gyro_sigma * rng.standard_normal(gyro.shape)
@@ -68,14 +67,12 @@ class ImuSeries:
 
     def samples(self) -> list[ImuSample]:
         """The same as messages."""
+        stamps = self.stamps_ns.tolist()
+        rates = self.angular_velocities.tolist()
+        forces = self.linear_accelerations.tolist()
         return [
             ImuSample(stamp, tuple(rate), tuple(force))
-            for stamp, rate, force in zip(
-                self.stamps_ns.tolist(),
-                self.angular_velocities.tolist(),
-                self.linear_accelerations.tolist(),
-                strict=True,
-            )
+            for stamp, rate, force in zip(stamps, rates, forces, strict=True)
         ]
 
 
@@ -102,9 +99,8 @@ class Simulation:
         """Render frame `index`: gray values (H, W)."""
         gray = self.renderer.render(self.seconds(self.reference_ns(index)))
         rng = _stream(self.config.seed, _IMAGE, index)
-        gray = gray + np.float32(self.config.pixel_noise) * rng.standard_normal(
-            gray.shape, dtype=np.float32
-        )
+        noise = rng.standard_normal(gray.shape, dtype=np.float32)
+        gray = gray + np.float32(self.config.pixel_noise) * noise
         return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
 
     def seconds(self, time_ns: int) -> float:

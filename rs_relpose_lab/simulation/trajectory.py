@@ -62,9 +62,8 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         count = len(self.positions)
-        knots = self.first_control + self.spacing * (
-            np.arange(count + DEGREE + 1) - (DEGREE + 1) / 2
-        )
+        places = np.arange(count + DEGREE + 1) - (DEGREE + 1) / 2
+        knots = self.first_control + self.spacing * places
         controls = np.hstack([self.positions, self.angles])
         object.__setattr__(self, '_spline', BSpline(knots, controls, DEGREE, extrapolate=False))
 
@@ -123,15 +122,17 @@ def _body_rates(angles: Array, first: Array, second: Array) -> tuple[Array, Arra
     cp = np.cos(pitch)
     sr = np.sin(roll)
     cr = np.cos(roll)
-    rate = np.stack([dr - dy * sp, dp * cr + dy * sr * cp, -dp * sr + dy * cr * cp], axis=1)
-    change = np.stack(
-        [
-            ddr - ddy * sp - dy * cp * dp,
-            ddp * cr - dp * sr * dr + ddy * sr * cp + dy * (cr * cp * dr - sr * sp * dp),
-            -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * (sr * cp * dr + cr * sp * dp),
-        ],
-        axis=1,
-    )
+    rate_x = dr - dy * sp
+    rate_y = dp * cr + dy * sr * cp
+    rate_z = -dp * sr + dy * cr * cp
+    # Derivatives of sin r cos p and, negated, of cos r cos p.
+    sr_cp = cr * cp * dr - sr * sp * dp
+    cr_cp = sr * cp * dr + cr * sp * dp
+    change_x = ddr - ddy * sp - dy * cp * dp
+    change_y = ddp * cr - dp * sr * dr + ddy * sr * cp + dy * sr_cp
+    change_z = -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * cr_cp
+    rate = np.stack([rate_x, rate_y, rate_z], axis=1)
+    change = np.stack([change_x, change_y, change_z], axis=1)
     return rate, change
 
 
@@ -147,9 +148,8 @@ class FinePath:
         self.begin = begin
         times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
         self.positions, self.rotations = trajectory.poses(times)
-        self.steps = Rotation.from_matrix(
-            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])
-        ).as_rotvec()
+        turns = np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])
+        self.steps = Rotation.from_matrix(turns).as_rotvec()
 
     def motion_from(self, reference: float) -> Motion:
         """Motion of a frame, whose times count from the time of its reference row [s]."""
@@ -158,7 +158,8 @@ class FinePath:
             at = (reference + times - self.begin) / self.step
             k = np.clip(at.astype(int), 0, len(self.steps) - 1)
             share = (at - k)[:, None]
-            position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
+            step = self.positions[k + 1] - self.positions[k]
+            position = self.positions[k] + share * step
             rotated = np.einsum('nji,nj->ni', self.rotations[k], points - position)
             # Of 1e-3 rad: exact to 1e-6.
             return np.asarray(rotated - share * np.cross(self.steps[k], rotated))
