@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_walks import bag_of, small_walk
 import yaml
 
-from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation import simulate
 from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_ros.calibrate import procedure, recording
 from rs_relpose_ros.calibration.observations import GyroSeries, TrackedPoints
@@ -24,24 +25,12 @@ from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
-SMALL = SimulationConfig(
-    duration=3.0,
-    width=320,
-    height=240,
-    fx=225.0,
-    edge_samples=1,
-    plan='walk:3',
-    readout_time=0.02,
-    time_offset=0.03,
-    seed=5,
-)
+SMALL = small_walk(3.0)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp('walk') / 'bag'
-    write_bag(simulate(SMALL), folder)
-    return folder
+    return bag_of(SMALL, tmp_path_factory.mktemp('walk'))
 
 
 def calibrated(bag: Path, out: Path, *options: str) -> tuple[int, dict[str, Any]]:

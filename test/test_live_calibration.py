@@ -17,14 +17,13 @@ import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
+from small_walks import bag_of, small_walk
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_node_settings import FAKE_TF2_ROS
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
-from rs_relpose_lab.simulation import simulate, SimulationConfig
-from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_ros.bags import sensor_topics
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate import live, stored
@@ -41,24 +40,12 @@ from rs_relpose_ros.pipeline.sequencer import Refusal
 QUATERNION = (0.0, 0.0, 0.0, 1.0)
 CAMERA = CameraId('a/b:c', 320, 240)
 TEXT = '/**:\n  ros__parameters:\n    readout_time: 0.02\n    readout_time_sigma: 0.001\n'
-TRUTH = SimulationConfig(
-    duration=8.0,
-    width=320,
-    height=240,
-    fx=225.0,
-    edge_samples=1,
-    plan='walk:8',
-    readout_time=0.02,
-    time_offset=0.03,
-    seed=5,
-)
+TRUTH = small_walk(8.0)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp('walk') / 'bag'
-    write_bag(simulate(TRUTH), folder)
-    return folder
+    return bag_of(TRUTH, tmp_path_factory.mktemp('walk'))
 
 
 # -- the file ------------------------------------------------------------------------------------

@@ -127,6 +127,21 @@ VELOCITY = np.array([0.9, 0.3, 0.4])
 POINTS = RNG.uniform([-4, -3, 4], [9, 4, 14], (900, 3))
 
 
+def pose_of(pair, camera, **settings):
+    """The two-view estimate of an exact pair."""
+    return estimate_relative_pose(
+        pair.points1,
+        pair.points2,
+        camera,
+        pair.motion1,
+        pair.motion2,
+        pair.segment.rotation,
+        pair.segment.covariance,
+        pair.interval,
+        EstimatorConfig(**settings),
+    )
+
+
 def exposed(camera, start):
     """Pixels (N, 2) of a frame whose stamped row is exposed at `start` [s], and if it is."""
     tau = np.zeros(len(POINTS))
@@ -281,17 +296,7 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
         pair = replace(
             pair, points1=pair.points1 + noise[0, :n], points2=pair.points2 + noise[1, :n]
         )
-        return pair, estimate_relative_pose(
-            pair.points1,
-            pair.points2,
-            camera,
-            pair.motion1,
-            pair.motion2,
-            pair.segment.rotation,
-            pair.segment.covariance,
-            pair.interval,
-            EstimatorConfig(pixel_sigma=0.3),
-        )
+        return pair, pose_of(pair, camera, pixel_sigma=0.3)
 
     def off(pair, pose):
         turn = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
@@ -318,17 +323,7 @@ def test_a_deviation_shifts_the_rotation_by_the_images_alone(name):
     def off(start, wrong):
         """Error of the rotation by the images alone, and J."""
         pair = pair_data(start, start + 0.3, wrong)
-        pose = estimate_relative_pose(
-            pair.points1,
-            pair.points2,
-            CAMERA,
-            pair.motion1,
-            pair.motion2,
-            pair.segment.rotation,
-            pair.segment.covariance,
-            pair.interval,
-            EstimatorConfig(pixel_sigma=0.3),
-        )
+        pose = pose_of(pair, CAMERA, pixel_sigma=0.3)
         images = pose.images.of_rotation()
         best = Rotation.from_rotvec(-np.linalg.solve(images.information, images.gradient))
         middle = 0.5 * (CAMERA.readout_time + wrong[READOUT])
@@ -428,17 +423,7 @@ def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estima
 
         def estimated(right=0.0, down=0.0, pair=pair):
             camera = replace(CAMERA, cx=CAMERA.cx + right, cy=CAMERA.cy + down)
-            return estimate_relative_pose(
-                pair.points1,
-                pair.points2,
-                camera,
-                pair.motion1,
-                pair.motion2,
-                pair.segment.rotation,
-                pair.segment.covariance,
-                pair.interval,
-                EstimatorConfig(pixel_sigma=0.3),
-            )
+            return pose_of(pair, camera, pixel_sigma=0.3)
 
         # Nothing else is doubtful.
         def known(sigma):
@@ -1504,17 +1489,7 @@ def estimated_pairs(c, count):
         yield (
             400 * MS * k,
             pair,
-            estimate_relative_pose(
-                pair.points1,
-                pair.points2,
-                pair.camera,
-                pair.motion1,
-                pair.motion2,
-                pair.segment.rotation,
-                pair.segment.covariance,
-                pair.interval,
-                EstimatorConfig(),
-            ),
+            pose_of(pair, pair.camera),
         )
 
 
