@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from functools import reduce
+from itertools import pairwise
+import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,9 +23,10 @@ from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.velocity import expected_velocities
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu import integration
-from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample
+from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample, Series
 from rs_relpose_ros.imu.filters import BIAS_MEMORY, BiasTracker
 from rs_relpose_ros.imu.integration import ImuSlice
+from rs_relpose_ros.imu.noise import density_of, shown_density, third_differences
 from rs_relpose_ros.messages.incoming import imu_sample_from_message
 
 PERIOD = 5_000_000
@@ -106,6 +109,48 @@ def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
     assert np.array_equal(a.gravity(end).direction, b.gravity(end).direction)
     for first, second in zip(a.between(START + 1, end), b.between(START + 1, end), strict=True):
         assert np.array_equal(first, second)
+
+
+def coverage_by_all_steps(stamps, start_ns, end_ns, gap_ns):
+    """Coverage of [start_ns, end_ns] by sorted stamps, by the definition."""
+    if not stamps:
+        return Coverage.NOT_YET
+    if start_ns < stamps[0]:
+        return Coverage.NEVER
+    steps = pairwise(stamps)
+    inside = [after - before for before, after in steps if after > start_ns and before < end_ns]
+    if any(step > gap_ns for step in inside):
+        return Coverage.NEVER
+    return Coverage.AVAILABLE if stamps[-1] >= end_ns else Coverage.NOT_YET
+
+
+@given(
+    st.lists(st.integers(0, 60), max_size=40),
+    st.lists(st.tuples(st.integers(0, 60), st.integers(0, 20)), min_size=1, max_size=10),
+    st.integers(-5, 50),
+)
+def test_coverage_and_values_of_a_series_in_any_order(stamps, asked, pruned):
+    gap_ns = 6
+    series = Series(gap_ns, width=1)
+    for stamp_ns in stamps:
+        series.insert(stamp_ns, (float(stamp_ns**2),))
+    series.prune(pruned)
+    known = sorted(set(stamps))
+    older = [stamp_ns for stamp_ns in known if stamp_ns <= pruned]
+    known = known[max(len(older) - 1, 0) :]
+    assert series.stamps.tolist() == known
+    assert series.newest_ns == (known[-1] if known else None)
+    for start_ns, seconds in asked:
+        end_ns = start_ns + seconds
+        expected = coverage_by_all_steps(known, start_ns, end_ns, gap_ns)
+        assert series.coverage(start_ns, end_ns) is expected
+        found = series.between(start_ns, end_ns)
+        assert (found is not None) == (expected is Coverage.AVAILABLE)
+        if found is None:
+            continue
+        at = sorted({start_ns, end_ns, *(one for one in known if start_ns < one < end_ns)})
+        assert found[0].tolist() == at
+        np.testing.assert_allclose(found[1][:, 0], np.interp(at, known, np.square(known)))
 
 
 def test_coverage():
@@ -977,6 +1022,23 @@ def test_a_noise_up_to_the_configured_one_leaves_that(ratio):
     sigma = ratio * ImuConfig().gyro_noise_density * np.sqrt(200.0)
     rng = np.random.default_rng(8)
     assert noisy(lambda t: rng.normal(0.0, sigma, (len(t), 3))) == ImuConfig().gyro_noise_density
+
+
+@pytest.mark.parametrize('count', [12, 101, 200])
+def test_the_density_of_noise_is_by_medians(count):
+    rng = np.random.default_rng(count)
+    values = rng.normal(size=(count, 3)) * (1.0, 3.0, 2.0)
+    seconds = np.cumsum(rng.uniform(0.004, 0.006, count))
+    sizes = np.abs(np.diff(values, n=3, axis=0))
+    np.testing.assert_array_equal(third_differences(values), sizes)
+    # Of white noise of unit variance the median of the sizes is 0.6745 sqrt(20).
+    per_median = math.sqrt(float(np.median(np.diff(seconds)))) / (0.6745 * math.sqrt(20.0))
+    assert density_of(sizes, seconds) == pytest.approx(per_median * np.median(sizes), rel=1e-4)
+    medians = np.median(sizes, axis=0)
+    largest = per_median * medians.max()
+    noisiest = sizes[:, np.argmax(medians)]
+    assert density_of(noisiest, seconds) == pytest.approx(largest, rel=1e-4)
+    assert shown_density(values, seconds, 1e-6) <= 1.0001 * largest
 
 
 @pytest.mark.parametrize('axis', [0, 2, slice(None)])

@@ -6,6 +6,7 @@ images are turned by 90 degrees, the rows of the sensor are the columns of the i
 """
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -42,6 +43,17 @@ _LARGEST_IMAGE = 1_000_000
 # Largest focal length and distance of the principal point [px]: squares of rays cannot overflow.
 # [chosen: any value in 1e7..1e100 would do]
 _FARTHEST_PIXEL = 1e9
+
+
+# Number of lenses that are kept in the form that kernels take. Fewer would make some again that a
+# calibration tries in turn, more would take memory. [chosen: 10 to 1000 would do]
+_LENSES_KEPT = 64
+
+
+@lru_cache(maxsize=_LENSES_KEPT)
+def _compiled_lens(model: str, coefficients: tuple[float, ...]) -> CompiledLens:
+    """The lens of a model; a frame asks for it several times, and nobody may change its arrays."""
+    return DISTORTION_MODELS[model].lens(coefficients)
 
 
 def readout_direction(axis: int, seconds: float) -> str:
@@ -269,7 +281,7 @@ class RollingShutterCamera:
     @property
     def radial_coefficients(self) -> Array:
         """Coefficients (3,) k1, k2, k3 of the distortion."""
-        return self._compiled.radial[:3]
+        return self._compiled.radial[:3].copy()
 
     def _distorted(self, points: ArrayLike) -> Array:
         """Normalised points (N, 2) of raw pixels (N, 2), before the distortion is removed."""
@@ -290,7 +302,7 @@ class RollingShutterCamera:
 
     @property
     def _compiled(self) -> CompiledLens:
-        return self._lens.lens(self.distortion)
+        return _compiled_lens(self.distortion_model, self.distortion)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

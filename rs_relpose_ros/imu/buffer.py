@@ -6,6 +6,7 @@
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import pairwise
 import math
 from typing import NamedTuple
 
@@ -60,6 +61,10 @@ class Series:
         self._values = np.empty((_ROOM, width))
         self._start = 0
         self._end = 0
+        self.newest_ns: int | None = None  # the last stamp; None without any
+        # Stamps before and after each gap, in order: `coverage` is asked for several times with
+        # each sample and each frame.
+        self._gaps: list[tuple[int, int]] = []
 
     @property
     def stamps(self) -> Stamps:
@@ -71,67 +76,97 @@ class Series:
         """Values (K, width); likewise a view."""
         return self._values[self._start : self._end]
 
-    @property
-    def newest_ns(self) -> int | None:
-        """The last stamp; None without any."""
-        return int(self._stamps[self._end - 1]) if self._end > self._start else None
-
     def insert(self, stamp_ns: int, value: tuple[float, ...] | None) -> bool:
         """Insert in order; False for no value, and for a stamp that exists already."""
         if value is None:
             return False
-        stamps = self.stamps
-        position = len(stamps)
-        if position and stamp_ns <= stamps[-1]:
-            position = int(np.searchsorted(stamps, stamp_ns))
-            if stamps[position] == stamp_ns:
-                return False
-        if self._end == len(self._stamps):
-            more = max(_ROOM, len(stamps))
-            self._values = np.concatenate([self.values, np.empty((more, self._values.shape[1]))])
-            self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
-            self._start = 0
-            self._end = len(stamps)
+        newest_ns = self.newest_ns
+        if newest_ns is not None and stamp_ns <= newest_ns:
+            return self._insert_late(stamp_ns, value)
+        self._make_room()
+        self._stamps[self._end] = stamp_ns
+        self._values[self._end] = value
+        self._end += 1
+        self.newest_ns = int(stamp_ns)
+        if newest_ns is not None and stamp_ns - newest_ns > self._gap_ns:
+            self._gaps.append((newest_ns, self.newest_ns))
+        return True
+
+    def _insert_late(self, stamp_ns: int, value: tuple[float, ...]) -> bool:
+        """Insert a sample that is not the newest; False for a stamp that exists already."""
+        position = int(self.stamps.searchsorted(stamp_ns))
+        after_ns = int(self.stamps[position])
+        if after_ns == stamp_ns:
+            return False
+        self._make_room()
         at = self._start + position
-        if at < self._end:
-            later = slice(at, self._end)
-            moved = slice(at + 1, self._end + 1)
-            for column in (self._stamps, self._values):
-                column[moved] = column[later]
+        later = slice(at, self._end)
+        moved = slice(at + 1, self._end + 1)
+        for column in (self._stamps, self._values):
+            column[moved] = column[later]
         self._stamps[at] = stamp_ns
         self._values[at] = value
         self._end += 1
+        # The sample divides a step: what was a gap may be two, one or none now.
+        around = [after_ns] if position == 0 else [int(self._stamps[at - 1]), after_ns]
+        divided = [gap for gap in self._gaps if gap != tuple(around)]
+        steps = pairwise(sorted([*around, int(stamp_ns)]))
+        gaps = [step for step in steps if step[1] - step[0] > self._gap_ns]
+        self._gaps = sorted([*divided, *gaps])
         return True
+
+    def _make_room(self) -> None:
+        """Let the arrays grow where they are full."""
+        if self._end < len(self._stamps):
+            return
+        stamps = self.stamps
+        more = max(_ROOM, len(stamps))
+        self._values = np.concatenate([self.values, np.empty((more, self._values.shape[1]))])
+        self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
+        self._start = 0
+        self._end = len(stamps)
 
     def prune(self, before_ns: int) -> None:
         """Remove samples before `before_ns`, except the last of them, for interpolation."""
         keep = self.number_until(before_ns) - 1
         if keep > 0:
             self._start += keep
+            first_ns = int(self._stamps[self._start])
+            self._gaps = [gap for gap in self._gaps if gap[0] >= first_ns]
 
     def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
         """Stamps (K,), values (K, width), borders interpolated; None if not covered."""
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
-        if start_ns == end_ns:
-            return np.array([start_ns]), self._interpolated(start_ns)[None]
         first = self.number_until(start_ns)
+        begin = self._interpolated(start_ns, first)
+        if start_ns == end_ns:
+            return np.array([start_ns]), begin[None]
         last = int(self.stamps.searchsorted(end_ns))
-        stamps = np.concatenate([[start_ns], self.stamps[first:last], [end_ns]])
-        begin = self._interpolated(start_ns)
-        end = self._interpolated(end_ns)
-        return stamps, np.vstack([begin, self.values[first:last], end])
+        stamps = np.empty(last - first + 2, dtype=np.int64)
+        stamps[0] = start_ns
+        stamps[1:-1] = self.stamps[first:last]
+        stamps[-1] = end_ns
+        values = np.empty((len(stamps), self._values.shape[1]))
+        values[0] = begin
+        values[1:-1] = self.values[first:last]
+        values[-1] = self._interpolated(end_ns, last)
+        return stamps, values
 
-    def _interpolated(self, at_ns: int) -> Array:
-        stamps = self.stamps
-        after = int(stamps.searchsorted(at_ns))
-        value = self.values[after]
-        if stamps[after] == at_ns:
-            return value
-        before = self.values[after - 1]
-        before_ns = stamps[after - 1]
+    def _interpolated(self, at_ns: int, after: int) -> Array:
+        """Value (width,) at a time; `after`: number of a sample then, or of the first later one.
+
+        Of the last sample, the number of all samples will do.
+        """
+        stamps, values = self.stamps, self.values
+        before = after - 1
+        if after < len(stamps) and stamps[after] == at_ns:
+            return values[after]
+        before_ns = stamps[before]
+        if before_ns == at_ns:
+            return values[before]
         fraction = (at_ns - before_ns) / (stamps[after] - before_ns)
-        return np.asarray(before + fraction * (value - before))
+        return np.asarray(values[before] + fraction * (values[after] - values[before]))
 
     def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
         """Stamps within an interval, and one on either side of it."""
@@ -145,16 +180,14 @@ class Series:
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
-        stamps = self.stamps
-        if len(stamps) == 0:
+        if self._end == self._start:
             return Coverage.NOT_YET
-        if start_ns < stamps[0]:
+        if start_ns < self._stamps[self._start]:
             return Coverage.NEVER
-        known = self.enclosing(start_ns, end_ns)
-        steps = known[1:] - known[:-1]  # np.diff takes longer than all the rest
-        if (steps > self._gap_ns).any():
+        if any(before < end_ns and after > start_ns for before, after in self._gaps):
             return Coverage.NEVER
-        return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
+        is_known = end_ns <= self._stamps[self._end - 1]
+        return Coverage.AVAILABLE if is_known else Coverage.NOT_YET
 
 
 class StampDoubt(NamedTuple):
@@ -267,6 +300,21 @@ class ImuInterval(NamedTuple):
         return np.asarray(rotations[-1].T @ mean)
 
 
+def _is_finite(vector: Vector | None) -> bool:
+    """Whether a vector, if there is one, has finite elements."""
+    if vector is None:
+        return True
+    x, y, z = vector
+    return math.isfinite(x) and math.isfinite(y) and math.isfinite(z)
+
+
+def _not_finite(sample: ImuSample) -> str:
+    """Text about a sample with a vector that is not finite."""
+    name = 'linear_acceleration' if _is_finite(sample.angular_velocity) else 'angular_velocity'
+    value = getattr(sample, name)
+    return f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, got {list(value)}'
+
+
 class ImuSamples:
     """Samples of both sensors and orientations, in any order; `max_gap` [s] covers an interval."""
 
@@ -283,8 +331,8 @@ class ImuSamples:
     @property
     def newest_ns(self) -> int | None:
         """Newest stamp of any kind."""
-        newest = (series.newest_ns for series in (self.gyro, self.force, self._down))
-        return max((stamp_ns for stamp_ns in newest if stamp_ns is not None), default=None)
+        newest = [series.newest_ns for series in (self.gyro, self.force, self._down)]
+        return max([stamp_ns for stamp_ns in newest if stamp_ns is not None], default=None)
 
     @property
     def both_until_ns(self) -> int | None:
@@ -302,14 +350,8 @@ class ImuSamples:
 
     def add(self, sample: ImuSample) -> bool:
         """Store a sample, or False for a duplicate; InputError if a value is not finite."""
-        for name, value in (
-            ('angular_velocity', sample.angular_velocity),
-            ('linear_acceleration', sample.linear_acceleration),
-        ):
-            if value is not None and not all(map(math.isfinite, value)):
-                raise InputError(
-                    f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, got {list(value)}'
-                )
+        if not (_is_finite(sample.angular_velocity) and _is_finite(sample.linear_acceleration)):
+            raise InputError(_not_finite(sample))
         added = self.gyro.insert(sample.stamp_ns, sample.angular_velocity)
         added |= self.force.insert(sample.stamp_ns, sample.linear_acceleration)
         return self._down.insert(sample.stamp_ns, sample.orientation) or added
@@ -599,7 +641,8 @@ def _mean_force(motion: FrameMotion, times_ns: Stamps, forces: Array) -> Array:
     forces = np.einsum('kij,kj->ki', motion.rotations(row_times), forces)
     if len(forces) == 1:
         return np.asarray(forces[0])
-    after = np.diff(row_times, append=row_times[-1])
-    before = np.diff(row_times, prepend=row_times[0])
-    weights = after + before
+    steps = row_times[1:] - row_times[:-1]
+    weights = np.zeros(len(row_times))
+    weights[:-1] = steps
+    weights[1:] += steps
     return np.asarray(weights @ forces / weights.sum())

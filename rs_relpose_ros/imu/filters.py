@@ -293,7 +293,8 @@ class GravityFilter:
         up = self._state.up
         # A rotation about the direction itself is no error.
         spread = self._state.errors[:3, :3]
-        variance = 0.5 * float(np.trace(spread) - up @ spread @ up)
+        total = spread[0, 0] + spread[1, 1] + spread[2, 2]
+        variance = 0.5 * float(total - up @ spread @ up)
         # The part of the mean residual above the noise is lasting and biases the direction.
         residual = self._state.residual - up * (up @ self._state.residual)
         of_noise = 2.0 * self._noise.acceleration / STANDARD_GRAVITY**2

@@ -51,15 +51,33 @@ def shown_density(values: Array, seconds: Array, configured: float) -> float:
 
 
 def _of_noisiest_axis(values: Array, seconds: Array) -> float:
-    return max(density_of(axis, seconds) for axis in third_differences(values).T)
+    medians = _medians(third_differences(values))
+    return _density(max(medians.tolist()), seconds)
 
 
 def third_differences(values: Array) -> Array:
     """Sizes (K - 3, 3) of the third differences of samples (K, 3)."""
-    return np.abs(np.diff(values, n=3, axis=0))
+    for _ in range(3):
+        values = values[1:] - values[:-1]
+    return np.abs(values)
 
 
 def density_of(differences: Array, seconds: Array) -> float:
     """Density by sizes of third differences of samples at times (K,), of any axes."""
-    sigma = SIGMA_PER_MEDIAN * float(np.median(differences)) / math.sqrt(_THIRD_DIFFERENCE)
-    return sigma * math.sqrt(float(np.median(np.diff(seconds))))
+    return _density(float(_medians(differences.ravel())), seconds)
+
+
+def _density(median: float, seconds: Array) -> float:
+    """The same by the median of these sizes."""
+    sigma = SIGMA_PER_MEDIAN * median / math.sqrt(_THIRD_DIFFERENCE)
+    step = float(_medians(seconds[1:] - seconds[:-1]))
+    return sigma * math.sqrt(step)
+
+
+def _medians(values: Array) -> Array:
+    """Medians along the first axis; ``np.median`` takes three times as long for some hundred."""
+    ordered = np.sort(values, axis=0)
+    middle = len(values) // 2
+    if len(values) % 2:
+        return np.asarray(ordered[middle])
+    return np.asarray(0.5 * (ordered[middle - 1] + ordered[middle]))

@@ -153,15 +153,18 @@ def _down(msg: Any) -> tuple[float, float, float, float] | None:
 
 def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:
     """Elements of a geometry_msgs/Vector3; InputError where one is not finite or too large."""
-    values = float(vector.x), float(vector.y), float(vector.z)
+    x = float(vector.x)
+    y = float(vector.y)
+    z = float(vector.z)
+    if -largest <= x <= largest and -largest <= y <= largest and -largest <= z <= largest:
+        return x, y, z
+    values = (x, y, z)
     if not all(map(math.isfinite, values)):
         raise InputError(f'{name} of an IMU message must be finite, got {list(values)}')
-    if max(map(abs, values)) > largest:
-        raise InputError(
-            f'{name} of an IMU message must be at most {largest:g}, '
-            f'got {list(values)}: is it in rad/s and m/s^2?'
-        )
-    return values
+    raise InputError(
+        f'{name} of an IMU message must be at most {largest:g}, '
+        f'got {list(values)}: is it in rad/s and m/s^2?'
+    )
 
 
 # -- Topics by role, live and offline -------------------------------------------------------------
@@ -284,6 +287,8 @@ class StuckGyro:
             return False
         for axis, value in enumerate(rate):
             self._add(axis, value, sample.stamp_ns)
+        if max(self._counts) == 1:
+            return False  # no axis repeats its value
         count = min(self._counts)
         since_ns = max(self._since_ns)
         clipped = self._clipped_axis(rate) if count == 1 else None
@@ -301,7 +306,9 @@ class StuckGyro:
             self._since_ns[axis] = stamp_ns
             self._counts[axis] = 0
         self._counts[axis] += 1
-        self._largest[axis] = max(self._largest[axis], abs(value))
+        size = abs(value)
+        if size > self._largest[axis]:
+            self._largest[axis] = size
 
     def _clipped_axis(self, rate: tuple[float, float, float]) -> int | None:
         """The first axis that repeats a value at which a driver or a filter may clip."""
