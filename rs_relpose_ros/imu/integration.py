@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array, so3, validate
@@ -221,10 +221,26 @@ def interpolated(times: Array, knots: Array, values: Array) -> Array:
     return np.column_stack([np.interp(times, knots, column) for column in values.T])
 
 
+class ForcePath(NamedTuple):
+    """Specific force integrated from the first sample on, in the axes of that sample."""
+
+    gyro: GyroPath  # at the times (K,) of the samples
+    once: Array  # (K, 3) [m/s]
+    twice: Array  # (K, 3) [m]
+
+    @classmethod
+    def integrated(cls, seconds: Array, rates: Array, forces: Array) -> ForcePath:
+        """Integrate samples at increasing times; rates and rotated forces are linear in between.
+
+        `seconds` (K,); `rates` (K, 3) [rad/s], bias removed; `forces` (K, 3) [m/s^2].
+        """
+        gyro = GyroPath.integrated(seconds, rates)
+        turned_forces = np.einsum('kij,kj->ki', gyro.rotations, forces)
+        return cls(gyro, *force_integrals(seconds, turned_forces))
+
+
 def preintegrate(
-    seconds: Array,
-    rates: Array,
-    forces: Array,
+    path: ForcePath,
     gravity: Array,
     gravity_covariance: Array,
     lever_arm: Array,
@@ -233,22 +249,19 @@ def preintegrate(
 ) -> InertialMotion:
     """Motion from the first to the last sample, in the axes of the first.
 
-    `seconds` (K,): increasing times, rates and rotated forces being linear in between. `rates`
-    (K, 3) [rad/s]: bias removed. `forces` (K, 3) [m/s^2]: specific force. `gravity` (3,) [m/s^2]:
-    of free fall, in the axes of the first sample. `lever_arm` (3,) [m]: position of the IMU in the
-    frame of these vectors. `bias_sigma` [rad/s]: of the gyro's bias, per axis.
+    `gravity` (3,) [m/s^2]: of free fall, in the axes of the first sample. `lever_arm` (3,) [m]:
+    position of the IMU in the frame of these vectors. `bias_sigma` [rad/s]: of the gyro's bias,
+    per axis.
     """
+    seconds, rates, rotations = path.gyro
     steps = np.diff(seconds)
     duration = float(seconds[-1] - seconds[0])
-    rotations = integrated_rotations(seconds, rates)
-    turned_forces = np.einsum('kij,kj->ki', rotations, forces)
-    once, twice = force_integrals(seconds, turned_forces)
-    beta = once[-1] + duration * gravity
-    alpha = twice[-1] + 0.5 * duration**2 * gravity
+    beta = path.once[-1] + duration * gravity
+    alpha = path.twice[-1] + 0.5 * duration**2 * gravity
 
     half_square = duration**2 / 2.0
     by_gravity = so3.by_axes(np.array([[half_square], [duration]]))
-    by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
+    by_bias, by_rates = _error_derivatives(path)
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
     integrals = np.array([[duration**3 / 3.0, half_square], [half_square, duration]])
@@ -291,16 +304,15 @@ def force_integrals(times: Array, forces: Array) -> tuple[Array, Array]:
 _SKEW = np.array([skew(axis).ravel() for axis in np.eye(3)])
 
 
-def _error_derivatives(
-    seconds: Array, rates: Array, rotations: Array, once: Array, twice: Array
-) -> tuple[Array, Array]:
+def _error_derivatives(path: ForcePath) -> tuple[Array, Array]:
     """Derivatives of (alpha, beta) by a bias of the force (6, 3), and by the rate of each step."""
+    seconds = path.gyro.times
+    once = path.once
+    twice = path.twice
     steps = np.diff(seconds)
     middle = seconds[:-1] + 0.5 * steps
     left = seconds[-1] - middle
-    half_turns = 0.25 * steps[:, None] * (rates[1:] + rates[:-1])
-    turned = Rotation.from_rotvec(half_turns).as_matrix()
-    halfway = rotations[:-1] @ turned
+    halfway = path.gyro.at(middle)
     # A bias rotates with the IMU.
     alpha_by_bias = np.einsum('k,kij->ij', left * steps, halfway)
     beta_by_bias = np.einsum('k,kij->ij', steps, halfway)
@@ -316,36 +328,77 @@ def _error_derivatives(
     return by_bias, by_rate * steps[:, None, None]
 
 
-def inertial_motion(
-    since: ImuSlice, first: FrameImu, second: FrameImu, config: ImuConfig
-) -> InertialMotion | str:
-    """Motion of the IMU between the stamped rows of two frames, or the reason for none.
+def inertial_motions(
+    since: ImuSlice, frames: Sequence[FrameImu], config: ImuConfig
+) -> list[InertialMotion | None] | str:
+    """Motion of the IMU from the first of `frames` to each one, or the reason for none.
 
-    `since`: the samples from the first frame's row to the second one's.
+    `since`: the samples from the first frame's stamped row to the last one's. The motion up to the
+    first frame is None, as is that up to a frame without specific force. Only the covariance of
+    the last motion is known; that of the others is zero.
     """
-    sigma = second.gravity_sigma
-    if reason := since.no_force or first.no_force or second.no_force:
+    first = frames[0]
+    last = frames[-1]
+    if reason := since.no_force or first.no_force or last.no_force:
         return reason
-    if second.motion.gravity is None or sigma is None:
+    path = ForcePath.integrated(*since.at_common_times())
+    R = path.gyro.rotations[-1]
+    known = _gravity_at_first(last, R)
+    if known is None:
         return 'the direction of gravity is not known'
-    seconds, rates, forces = since.at_common_times()
-    R = integrated_rotations(seconds, rates)[-1]
-    # Gravity as the accelerometer measures it: its scale and its bias along gravity cancel. The
-    # filter has had more samples at the second frame.
-    down = R @ second.motion.gravity
+    gravity, spread = known
+    whole = validate.replaced(
+        preintegrate(
+            path,
+            gravity,
+            spread,
+            np.array(config.imu_position),
+            _with_noise_of(since, config),
+            since.bias_sigma,
+        ),
+        acceleration1=first.force + gravity,
+        acceleration2=R @ last.force + gravity,
+    )
+    on_the_way = [_part_of(whole, path, first, frame, gravity) for frame in frames[1:-1]]
+    return [None, *on_the_way, whole]
+
+
+def _gravity_at_first(last: FrameImu, R: Array) -> tuple[Array, Array] | None:
+    """Gravity (3,) [m/s^2] in the axes of the first frame, and its covariance (3, 3).
+
+    None if its direction is not known.
+
+    As the accelerometer measures it: its scale and its bias along gravity cancel. The filter has
+    had more samples at the last frame, whose rotation from the first one is R (3, 3).
+    """
+    sigma = last.gravity_sigma
+    if last.motion.gravity is None or sigma is None:
+        return None
+    down = R @ last.motion.gravity
     down /= np.linalg.norm(down)
     along = np.outer(down, down)
-    gravity = second.at_rest * down
-    across_variance = (second.at_rest * sigma) ** 2
-    spread = across_variance * (np.eye(3) - along) + second.at_rest_sigma**2 * along
-    position = np.array(config.imu_position)
-    motion = preintegrate(
-        *(seconds, rates, forces, gravity, spread, position),
-        _with_noise_of(since, config),
-        since.bias_sigma,
-    )
+    across_variance = (last.at_rest * sigma) ** 2
+    spread = across_variance * (np.eye(3) - along) + last.at_rest_sigma**2 * along
+    return last.at_rest * down, spread
+
+
+def _part_of(
+    whole: InertialMotion, path: ForcePath, first: FrameImu, frame: FrameImu, gravity: Array
+) -> InertialMotion | None:
+    """The part of a motion up to a frame on the way."""
+    if frame.no_force:
+        return None
+    duration = seconds_between(first.reference_ns, frame.reference_ns)
+    # The stamped rows of all frames are samples of the slice.
+    times = path.gyro.times
+    k = int(np.argmin(np.abs(times - times[0] - duration)))
     return validate.replaced(
-        motion, acceleration1=first.force + gravity, acceleration2=R @ second.force + gravity
+        whole,
+        alpha=path.twice[k] + 0.5 * duration**2 * gravity,
+        beta=path.once[k] + duration * gravity,
+        duration=duration,
+        covariance=np.zeros((6, 6)),
+        acceleration2=path.gyro.rotations[k] @ frame.force + gravity,
     )
 
 
@@ -359,37 +412,3 @@ def _with_noise_of(since: ImuSlice, config: ImuConfig) -> ImuConfig:
     if all(getattr(config, name) == density for name, density in densities.items()):
         return config
     return validate.replaced(config, **densities)
-
-
-def motions_on_the_way(
-    whole: InertialMotion, first: FrameImu, since: ImuSlice, frames: Sequence[FrameImu]
-) -> list[InertialMotion | None]:
-    """Parts of the motion `whole` up to frames before the last one; None without accelerometer.
-
-    `since`: the samples from the first frame to the last one. The covariances are zero.
-    """
-    if since.no_force or first.no_force:
-        return [None] * len(frames)
-    seconds, rates, forces = since.at_common_times()
-    rotations = integrated_rotations(seconds, rates)
-    turned_forces = np.einsum('kij,kj->ki', rotations, forces)
-    once, twice = force_integrals(seconds, turned_forces)
-    gravity = np.asarray(whole.acceleration1) - first.force
-
-    def up_to(frame: FrameImu) -> InertialMotion | None:
-        if frame.no_force:
-            return None
-        duration = seconds_between(first.reference_ns, frame.reference_ns)
-        # The stamped rows of all frames are samples of the slice.
-        apart = np.abs(seconds - seconds[0] - duration)
-        k = int(np.argmin(apart))
-        return validate.replaced(
-            whole,
-            alpha=twice[k] + 0.5 * duration**2 * gravity,
-            beta=once[k] + duration * gravity,
-            duration=duration,
-            covariance=np.zeros((6, 6)),
-            acceleration2=rotations[k] @ frame.force + gravity,
-        )
-
-    return [up_to(frame) for frame in frames]

@@ -33,8 +33,7 @@ from rs_relpose_ros.imu.buffer import EXACT, StampDoubt
 from rs_relpose_ros.imu.integration import (
     FrameImu,
     ImuSlice,
-    inertial_motion,
-    motions_on_the_way,
+    inertial_motions,
 )
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -463,25 +462,21 @@ class TrackHistory:
         self, imus: Sequence[FrameImu], near: bool, parameters: Parameters
     ) -> tuple[str, tuple[InertialMotion | None, ...]]:
         """Why the accelerometer is not used, or empty; and the motion up to each frame."""
-        unknown: tuple[None, ...] = (None,) * len(imus)
+        unknown = (None,) * len(imus)
         if not near:
             return 'the frames are further apart than max_keyframe_interval', unknown
-        whole = inertial_of(
-            imus[0],
-            imus[-1],
-            self.since,
-            parameters,
-        )
-        if isinstance(whole, str):
-            return whole, unknown
-        assert self.since is not None
-        on_the_way = motions_on_the_way(
-            whole,
-            imus[0],
-            self.since,
-            imus[1:-1],
-        )
-        return '', (None, *on_the_way, whole)
+        if not parameters.pair.use_accelerometer:
+            return 'use_accelerometer is false', unknown
+        if not parameters.pair.use_gyro_rotation:
+            # The gyro rotates the specific force.
+            return 'use_gyro_rotation is false', unknown
+        since = self.since
+        if since is None:
+            return 'the gyro has a gap', unknown
+        motions = inertial_motions(since, imus, parameters.imu)
+        if isinstance(motions, str):
+            return motions, unknown
+        return '', tuple(motions)
 
     # Each step of a tracker adds its error, and the windows of a pair's last frame are aligned
     # with the windows of its first one: the drift of a track is known there. The drift of an
@@ -547,28 +542,6 @@ class TrackHistory:
 
 # Rotation of a frame where the gyro does not give it. [derived: NaN is not known]
 _UNKNOWN = np.full((3, 3), math.nan)
-
-
-def inertial_of(
-    first: FrameImu, second: FrameImu, since: ImuSlice | None, parameters: Parameters
-) -> InertialMotion | str:
-    """Motion of a pair by the accelerometer, or the reason why it is not known.
-
-    `since`: the samples from the first frame to the second one.
-    """
-    if not parameters.pair.use_accelerometer:
-        return 'use_accelerometer is false'
-    if not parameters.pair.use_gyro_rotation:
-        # The gyro rotates the specific force.
-        return 'use_gyro_rotation is false'
-    if since is None:
-        return 'the gyro has a gap'
-    return inertial_motion(
-        since,
-        first,
-        second,
-        parameters.imu,
-    )
 
 
 def _rate_doubt(since: ImuSlice | None, imu: ImuConfig, camera: RollingShutterCamera) -> float:
