@@ -344,8 +344,6 @@ class Pipeline(Processor[PairResult]):
     ) -> PairResult:
         """The pair, suppressed by the findings on the pairs before."""
         monitor = self._monitor
-        since = history.since
-        assert since is not None
         matches = self._tracker.refined_matches()
         self._note_scatter(frame.imu_doubt.varying)
         problem = history.problem(
@@ -357,35 +355,13 @@ class Pipeline(Processor[PairResult]):
         )
         monitor.acceleration.note_length(*_length_at_rest(frame.imu, parameters.imu))
         pose = self._estimated(problem, frame.stamp_ns)
-        # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
-        fitted = pose.diagnostics.rejected or pose
-        known = fitted.rotation_known
-        data = _measurement(problem, fitted, since, parameters) if known else None
-        # A pair that may follow a moving object is no evidence, and has no pose.
-        follows_object = data is not None and monitor.second_motions.add(data, fitted)
-        if follows_object:
-            data = None
-            if monitor.second_motions.has_come:
-                monitor.restart()  # pairs before may have followed it, too
+        since = history.since
+        assert since is not None
         configured = self._configured(
             frame.applied_offset_ns, frame.imu_doubt.common, since, sensor, parameters
         )
         stamps_ns = history.stamp_ns, frame.stamp_ns
-        doubtful = monitor.clock_steps.add(stamps_ns, since, data, pose)
-        if data is not None:
-            is_allowed = monitor.deviates_as_allowed(configured)
-            monitor.contradictions.add(pose, is_allowed=is_allowed)
-        assessed = monitor.add_pair(frame.stamp_ns, data, fitted, configured)
-        if fitted is pose:
-            pose = monitor.widened(stamps_ns, pose, assessed, parameters.imu)
-        published = pose
-        if parameters.pair.withhold_when_wrong:
-            published = monitor.without_doubtful(
-                pose,
-                has_rate_doubt=problem.rate_doubt > 0.0,
-                may_be_step=doubtful,
-                follows_object=follows_object,
-            )
+        pose, published = self._doubted(pose, problem, since, stamps_ns, configured, parameters)
         rays = self._derotate(matches, history.imu.motion, frame.imu.motion, sensor)
         intrinsics = frame.intrinsics
         size = intrinsics.image_width, intrinsics.image_height
@@ -398,6 +374,47 @@ class Pipeline(Processor[PairResult]):
             lesson=self._lesson,
             image2=frame.image if self._keep_images else None,
         )
+
+    def _doubted(
+        self,
+        pose: RelativePose,
+        problem: PairProblem,
+        since: ImuSlice,
+        stamps_ns: tuple[int, int],
+        configured: Configured,
+        parameters: Parameters,
+    ) -> tuple[RelativePose, RelativePose]:
+        """Show a pair to the monitor; its pose with all doubts, and the pose to publish.
+
+        `stamps_ns`: of both frames. A pose that is withheld is published as none, with the reason.
+        """
+        monitor = self._monitor
+        # The monitor also gets a pose that contradicts the IMU: it shows what is wrong.
+        fitted = pose.diagnostics.rejected or pose
+        known = fitted.rotation_known
+        data = _measurement(problem, fitted, since, parameters) if known else None
+        # A pair that may follow a moving object is no evidence, and has no pose.
+        follows_object = data is not None and monitor.second_motions.add(data, fitted)
+        if follows_object:
+            data = None
+            if monitor.second_motions.has_come:
+                monitor.restart()  # pairs before may have followed it, too
+        may_be_step = monitor.clock_steps.add(stamps_ns, since, data, pose)
+        if data is not None:
+            is_allowed = monitor.deviates_as_allowed(configured)
+            monitor.contradictions.add(pose, is_allowed=is_allowed)
+        assessed = monitor.add_pair(stamps_ns[1], data, fitted, configured)
+        if fitted is pose:
+            pose = monitor.widened(stamps_ns, pose, assessed, parameters.imu)
+        published = pose
+        if parameters.pair.withhold_when_wrong:
+            published = monitor.without_doubtful(
+                pose,
+                has_rate_doubt=problem.rate_doubt > 0.0,
+                may_be_step=may_be_step,
+                follows_object=follows_object,
+            )
+        return pose, published
 
     def _note_scatter(self, of_imu: float) -> None:
         """Note the scatter of the last stamps for the pair; `of_imu` [s]: that of the gyro's."""
