@@ -37,6 +37,8 @@ numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
 html_theme = 'alabaster'
+# Has custom.css, which the theme loads.
+html_static_path = ['_static']
 html_title = f'rs_relpose_ros {release}'
 html_theme_options = {
     'description': 'Relative pose of rolling-shutter images, aided by an IMU',

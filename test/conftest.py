@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterator
 import csv
 import os
 from pathlib import Path
+import shutil
 import sys
+from typing import Any
 
 from hypothesis import HealthCheck, settings
 import pytest
@@ -147,6 +149,21 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
         assert words in error
 
     return run
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Any]:
+    """Chromium of the system, driven by Playwright; skips where one is missing."""
+    sync_api = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
+    names = ('chromium', 'chromium-browser', 'google-chrome')
+    program = next(filter(None, map(shutil.which, names)), None)
+    if program is None:
+        pytest.skip('no Chromium: apt-get install chromium')
+    with sync_api.sync_playwright() as playwright:
+        # Containers have no user namespaces for its sandbox; the pages are ours.
+        started = playwright.chromium.launch(executable_path=program, args=['--no-sandbox'])
+        yield started
+        started.close()
 
 
 @pytest.fixture

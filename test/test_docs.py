@@ -104,11 +104,14 @@ def test_the_examples_of_the_python_interface_are_true(monkeypatch):
 # -- HTML -------------------------------------------------------------------------------------
 
 
-def test_the_pages_are_built_without_a_warning(tmp_path):
+@pytest.fixture(scope='module')
+def pages(tmp_path_factory):
+    """Folder of the HTML pages."""
     pytest.importorskip('sphinx', reason='sphinx is not installed: make docs installs it')
     pytest.importorskip('myst_parser', reason='myst_parser is not installed')
     options = ['--fail-on-warning', '--keep-going', '--quiet', '-b', 'html']
-    folders = ['-d', str(tmp_path / 'doctrees'), 'docs', str(tmp_path / 'html')]
+    folder = tmp_path_factory.mktemp('pages')
+    folders = ['-d', str(folder / 'doctrees'), 'docs', str(folder / 'html')]
     built = subprocess.run(
         [sys.executable, '-m', 'sphinx', *options, *folders],
         cwd=ROOT,
@@ -118,12 +121,30 @@ def test_the_pages_are_built_without_a_warning(tmp_path):
         check=False,
     )
     assert (built.returncode, built.stderr) == (0, '')
-    front = (tmp_path / 'html' / 'index.html').read_text(encoding='utf-8')
+    return folder / 'html'
+
+
+def test_the_pages_are_built_without_a_warning(pages):
+    front = (pages / 'index.html').read_text(encoding='utf-8')
     assert 'I have a camera' in front and '<img' in front
-    api = (tmp_path / 'html' / 'api.html').read_text(encoding='utf-8')
+    api = (pages / 'api.html').read_text(encoding='utf-8')
     assert [name for _, name in PUBLIC if f'>{name}<' not in api] == []
     loaded = re.findall(r'(?:src|href)="(https?://[^"]+\.(?:js|css))', front + api)
     assert loaded == []
+
+
+@pytest.mark.parametrize('name', ['index', 'api', 'health', 'lab/evaluation'])
+def test_pages_are_no_wider_than_a_phone(name, pages, browser):
+    context = browser.new_context(viewport={'width': 400, 'height': 900}, offline=True)
+    tab = context.new_page()
+    tab.goto((pages / f'{name}.html').as_uri())
+    assert tab.evaluate('document.documentElement.scrollWidth') <= 400
+    # The text comes before the navigation.
+    text, navigation = (
+        tab.locator(part).bounding_box()['y'] for part in ('div.body', 'div.sphinxsidebar')
+    )
+    assert text < navigation
+    context.close()
 
 
 # -- Versions that are written twice ------------------------------------------------------------

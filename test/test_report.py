@@ -5,7 +5,6 @@ from html.parser import HTMLParser
 import math
 from pathlib import Path
 import re
-import shutil
 import time
 
 from conftest import BUNDLED_PARAMETERS, ROOT
@@ -223,21 +222,6 @@ def test_bad_input(words, problem, tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert problem in error and error.count('\n') == 1
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture(scope='module')
-def browser():
-    """Chromium of the system, driven by Playwright; skips where one is missing."""
-    sync_api = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
-    names = ('chromium', 'chromium-browser', 'google-chrome')
-    program = next(filter(None, map(shutil.which, names)), None)
-    if program is None:
-        pytest.skip('no Chromium: apt-get install chromium')
-    with sync_api.sync_playwright() as playwright:
-        # Containers have no user namespaces for its sandbox; the page is ours.
-        started = playwright.chromium.launch(executable_path=program, args=['--no-sandbox'])
-        yield started
-        started.close()
 
 
 @pytest.mark.parametrize(('width', 'scheme'), [(400, 'dark'), (1400, 'light')])
