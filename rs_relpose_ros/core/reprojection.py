@@ -170,13 +170,17 @@ class FrameInertia(NamedTuple):
 @kernel
 def fill_view(tracks: TrackBlocks, v: int, frame: FrameRays, inertia: FrameInertia) -> None:
     """Fill the observations of view v: derotated rays, and the displacement by the IMU."""
-    R, per_second = tracks.rotations[v], 1.0 / tracks.duration
+    R = tracks.rotations[v]
+    per_second = 1.0 / tracks.duration
     for n in range(len(frame.rays)):
         if not frame.used[n]:
             continue
-        b, i = n // BLOCK, n % BLOCK
+        b = n // BLOCK
+        i = n % BLOCK
         tracks.used[v, b, i] = True
-        o, E, tau = tracks.observations[v, b], frame.rotations[n], frame.times[n]
+        o = tracks.observations[v, b]
+        E = frame.rotations[n]
+        tau = frame.times[n]
         ray = rotated(E, frame.rays[n])
         by_u = rotated(E, frame.by_pixel[n, :, 0])
         by_v = rotated(E, frame.by_pixel[n, :, 1])
@@ -208,7 +212,9 @@ def fill_view(tracks: TrackBlocks, v: int, frame: FrameRays, inertia: FrameInert
 @small_kernel
 def _pseudo_inverse(by_u: Vector, by_v: Vector) -> tuple[Vector, Vector]:
     """Rows of ``(J^T J)^-1 J^T``, J having the two columns."""
-    uu, uv, vv = dot(by_u, by_u), dot(by_u, by_v), dot(by_v, by_v)
+    uu = dot(by_u, by_u)
+    uv = dot(by_u, by_v)
+    vv = dot(by_v, by_v)
     inverse = 1.0 / (uu * vv - uv * uv)
     return (
         scale(inverse, add(scale(vv, by_u), scale(-uv, by_v))),
@@ -219,7 +225,8 @@ def _pseudo_inverse(by_u: Vector, by_v: Vector) -> tuple[Vector, Vector]:
 @kernel
 def start_of_tracks(tracks: TrackBlocks, R: Array, t: Array) -> Array:
     """Tracks (blocks, TRACK_VALUES, BLOCK) by their first and last rays and the pose R, t."""
-    first, last = tracks.observations[0], tracks.observations[-1]
+    first = tracks.observations[0]
+    last = tracks.observations[-1]
     out = np.zeros((len(first), TRACK_VALUES, BLOCK))
     baseline = (t[0], t[1], t[2])
     for b in range(len(first)):
@@ -319,8 +326,10 @@ def observe(
     """
     k = path.scale
     for i in range(BLOCK):
-        s, rho = o[TIME, i], track[INVERSE_DISTANCE, i]
-        share, bends = s / path.duration, _bends(s, path.duration)
+        s = o[TIME, i]
+        rho = track[INVERSE_DISTANCE, i]
+        share = s / path.duration
+        bends = _bends(s, path.duration)
         moved = _with_accelerations(column(o, MOVED, i), bends, path)
         place = add(scale(share, path.t), scale(k, moved))
         before = add(column(track, DIRECTION, i), scale(-rho, place))
@@ -330,7 +339,8 @@ def observe(
         per_length = 1.0 / norm(ahead)
         ray = scale(per_length, ahead)
         off = add(ray, scale(-1.0, column(o, RAY, i)))
-        r_u, r_v = dot(column(o, TO_PIXELS, i), off), dot(column(o, TO_PIXELS + 3, i), off)
+        r_u = dot(column(o, TO_PIXELS, i), off)
+        r_v = dot(column(o, TO_PIXELS + 3, i), off)
         squares[i] = r_u * r_u + r_v * r_v
         root = 1.0 / math.sqrt(noise.variance + 0.25 * squares[i])
         root = root if squares[i] <= noise.farthest else 0.0
@@ -399,12 +409,14 @@ def observe_changes(
     out[:] = 0.0
     turned = part_of_frame(changes.turned.whole, changes.rows.first_knots, v)
     at_reference = changes.turned.at_reference[v]
-    rotation, rate = np.empty((3, 3)), np.empty(3)
+    rotation = np.empty((3, 3))
+    rate = np.empty(3)
     knot = 0
     for i in range(min(BLOCK, changes.rows.times.shape[1] - first)):
         if rows[FACTOR, 0, i] == 0.0:  # far
             continue
-        tau, share = changes.rows.times[v, first + i], changes.rows.shares[v, first + i]
+        tau = changes.rows.times[v, first + i]
+        share = changes.rows.shares[v, first + i]
         knot = knot_before(turned.path.times, tau, knot)
         write_state(turned.path, tau, knot, rotation, rate)
         row = RowState(rotation, rate, tau, share, knot)

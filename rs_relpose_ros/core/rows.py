@@ -90,8 +90,11 @@ def turned_path(path: GyroPath, R_cam_imu: Array, blur_rates: Array) -> TurnedPa
     [rad/s^3].
     """
     knots = len(path.times)
-    turns, turn_rates = np.zeros((knots, 3, _N_GYRO)), np.empty((knots, 3, _N_GYRO))
-    rotation, rate, blur_rate = np.empty((3, 3)), np.empty(3), np.empty(3)
+    turns = np.zeros((knots, 3, _N_GYRO))
+    turn_rates = np.empty((knots, 3, _N_GYRO))
+    rotation = np.empty((3, 3))
+    rate = np.empty(3)
+    blur_rate = np.empty(3)
     of_middle = np.empty((3, _N_GYRO))
     for k in range(knots):
         _write_turn_rates(
@@ -123,8 +126,10 @@ def add_by_gyro(J: Array, by_turn: Vector, turned: TurnedPath, time: float, k: i
     of_begin_rate = s * (1.0 - s) * (1.0 - s) * step
     of_end_rate = -s * s * (1.0 - s) * step
     for i in range(3):
-        begin, end = (1.0 - of_end) * by_turn[i], of_end * by_turn[i]
-        begin_rate, end_rate = of_begin_rate * by_turn[i], of_end_rate * by_turn[i]
+        begin = (1.0 - of_end) * by_turn[i]
+        end = of_end * by_turn[i]
+        begin_rate = of_begin_rate * by_turn[i]
+        end_rate = of_end_rate * by_turn[i]
         for g in range(_N_GYRO):
             J[_GYRO + g] += (
                 begin * turned.turns[k, i, g]
@@ -196,8 +201,10 @@ def row_states(path: GyroPath, R_cam_imu: Array, times: Array, shares: Array) ->
     """
     count = len(times)
     turned = turned_path(path, R_cam_imu, np.zeros(path.rates.shape))
-    rotations, turns = np.empty((count, 3, 3)), np.zeros((count, 3, N_DEVIATIONS))
-    delays, at_reference = np.zeros((count, N_DEVIATIONS)), np.zeros((3, N_DEVIATIONS))
+    rotations = np.empty((count, 3, 3))
+    turns = np.zeros((count, 3, N_DEVIATIONS))
+    delays = np.zeros((count, N_DEVIATIONS))
+    at_reference = np.zeros((3, N_DEVIATIONS))
     _write_turns(turned, 0.0, 0.0, np.empty((3, 3)), at_reference)
     for n in range(count):
         _write_turns(turned, times[n], shares[n], rotations[n], turns[n])
@@ -261,7 +268,8 @@ def turned_frames(rows: RowsOfFrames, R_cam_imu: Array) -> TurnedFrames:
 @small_kernel
 def part_of_frame(whole: TurnedPath, first_knots: NDArray[np.int64], v: int) -> TurnedPath:
     """The turned path of frame v."""
-    begin, end = first_knots[v], first_knots[v + 1]
+    begin = first_knots[v]
+    end = first_knots[v + 1]
     return TurnedPath(
         GyroPath(
             whole.path.times[begin:end],

@@ -172,7 +172,8 @@ def _eliminate(own: Array, rho: Array, mixed: Array, factors: Array, solved: Arr
 
     What is left of the products with the residual is the track's part of the gradient.
     """
-    n, weight = len(mixed) - 1, INVERSE_DISTANCE_SIGMA**-2
+    n = len(mixed) - 1
+    weight = INVERSE_DISTANCE_SIGMA**-2
     for i in range(BLOCK):
         mixed[n, 2, i] += weight * rho[i]
         own[2, 2, i] += weight
@@ -259,15 +260,20 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, noise:
     V, blocks, _ = tracks.used.shape
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
     n = path_unknowns + 3 * (V - 1)
-    path, rotations = _path(state, tracks.duration), _turned(tracks, state)
+    path = _path(state, tracks.duration)
+    rotations = _turned(tracks, state)
     used_rows = PATH - RESIDUAL + path_unknowns
-    rows, gram = np.empty((ROWS, 2, BLOCK)), np.empty((used_rows, used_rows))
+    rows = np.empty((ROWS, 2, BLOCK))
+    gram = np.empty((used_rows, used_rows))
     squares = np.empty((V, blocks, BLOCK))
     factors = np.empty((blocks, TRACK_UNKNOWNS, TRACK_UNKNOWNS, BLOCK))
-    solved, scores = np.empty((blocks, n + 1, TRACK_UNKNOWNS, BLOCK)), np.empty((n, BLOCK))
+    solved = np.empty((blocks, n + 1, TRACK_UNKNOWNS, BLOCK))
+    scores = np.empty((n, BLOCK))
     # The index n is the residual: its products are the gradient.
-    whole, scatter = np.zeros((n + 1, n + 1)), np.zeros((n, n))
-    sums, product = np.empty((n + 1, n + 1)), np.empty((n, n))
+    whole = np.zeros((n + 1, n + 1))
+    scatter = np.zeros((n, n))
+    sums = np.empty((n + 1, n + 1))
+    product = np.empty((n, n))
     for b in range(blocks):
         own = np.zeros((TRACK_UNKNOWNS, TRACK_UNKNOWNS, BLOCK))
         mixed = np.zeros((n + 1, TRACK_UNKNOWNS + 1, BLOCK))
@@ -290,7 +296,8 @@ def linearised(tracks: TrackBlocks, priors: PathPriors, state: PathState, noise:
         copy_matrix(mixed[:n, TRACK_UNKNOWNS], scores)
         np.dot(scores, scores.T, product)
         scatter += product
-    hessian, gradient = whole[:n, :n].copy(), whole[n, :n].copy()
+    hessian = whole[:n, :n].copy()
+    gradient = whole[n, :n].copy()
     of_priors = _add_priors(state, priors, hessian, gradient)
     return Normal(state, of_priors, hessian, gradient, solved, factors, scatter, squares, noise)
 
@@ -307,11 +314,13 @@ def path_by_deviations(tracks: TrackBlocks, normal: Normal, changes: Changes) ->
     """
     state = normal.state
     V, blocks, _ = tracks.used.shape
-    n, deviations = len(normal.gradient), changes.rotations.shape[2]
+    n = len(normal.gradient)
+    deviations = changes.rotations.shape[2]
     D = deviations + OF_FRAME * len(changes.rate_changes)
     derivatives = np.empty(deviations)
     path_unknowns = ACCELERATION + 3 * len(state.accelerations)
-    path, rotations = _path(state, tracks.duration), _turned(tracks, state)
+    path = _path(state, tracks.duration)
+    rotations = _turned(tracks, state)
     used_rows = PATH - RESIDUAL + path_unknowns
     rows = np.empty((ROWS, 2, BLOCK))
     columns = np.empty((D, 2, BLOCK))
@@ -434,7 +443,10 @@ def adjust(
     equations about the state before it give the covariance.
     """
     observations = 2.0 * tracks.used.sum()
-    state, sigma, noise, damping = start, expected, expected, _FIRST_DAMPING
+    state = start
+    sigma = expected
+    noise = expected
+    damping = _FIRST_DAMPING
     normal = linearised(tracks, priors, state, Noise(sigma * sigma, math.inf))
     freedom = max(observations - TRACK_UNKNOWNS * tracks.number - len(normal.gradient), 1.0)
     for _ in range(_STEPS):
@@ -456,7 +468,9 @@ def adjust(
         new = linearised(tracks, priors, after, Noise(sigma * sigma, farthest))
         cost = _cost(normal, tracks, sigma, before)[0]
         if _cost(new, tracks, sigma, before)[0] < cost:  # False for NaN
-            state, normal, damping = after, new, 0.1 * damping
+            state = after
+            normal = new
+            damping = 0.1 * damping
         else:
             damping = max(100.0 * damping, 1e-4)
     common = (sigma / noise) ** 2

@@ -148,7 +148,8 @@ def _with_changes(
     by_frame = pose_moved[:, N_DEVIATIONS:]
     pose_moved[3:, :N_DEVIATIONS] += changes.rotations[-1]
     if doubts_frames:
-        of_rate, of_stamp = path.rate_doubt**2, path.config.stamp_sigma**2
+        of_rate = path.rate_doubt**2
+        of_stamp = path.config.stamp_sigma**2
         variances = np.tile([of_rate, of_rate, of_rate, of_stamp], len(path.motions))
         of_frames = by_frame * variances @ by_frame.T
         pose = replace(pose, covariance=pose.covariance + of_frames)

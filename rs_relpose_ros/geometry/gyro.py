@@ -57,7 +57,8 @@ class GyroPath(NamedTuple):
 def write_turned(rotation: Array, rate1: Array, rate2: Array, dt: float, out: Array) -> None:
     """Write ``R Exp(phi)`` after a step `dt` [s] between two rates: Rodrigues for each row."""
     across = cross(rate1, rate2)
-    mean, square_of_time = 0.5 * dt, dt * dt / 12.0
+    mean = 0.5 * dt
+    square_of_time = dt * dt / 12.0
     phi = (
         mean * (rate1[0] + rate2[0]) + square_of_time * across[0],
         mean * (rate1[1] + rate2[1]) + square_of_time * across[1],
@@ -113,7 +114,8 @@ def write_state(path: GyroPath, time: float, k: int, rotation: Array, rate: Arra
 def path_states(path: GyroPath, times: Array) -> tuple[Array, Array, NDArray[np.int64]]:
     """Rotations (N, 3, 3), rates (N, 3) and knots (N,) before times (N,)."""
     count = len(times)
-    rotations, rates = np.empty((count, 3, 3)), np.empty((count, 3))
+    rotations = np.empty((count, 3, 3))
+    rates = np.empty((count, 3))
     knots = np.empty(count, dtype=np.int64)
     k = 0
     for n in range(count):

@@ -155,7 +155,8 @@ class Lesson:
         """Learn, unless it was done before."""
         with self._lock:
             if self._learn is not None:
-                learn, self._learn = self._learn, None
+                learn = self._learn
+                self._learn = None
                 self._learned = learn()
         return self._learned
 

@@ -241,7 +241,8 @@ class Pipeline(Processor[PairResult]):
     def prepare(self) -> None:
         """Learn from a pair, assess the configuration, search new corners: it is published."""
         if self._lesson is not None:
-            lesson, self._lesson = self._lesson, None
+            lesson = self._lesson
+            self._lesson = None
             lesson()
         if self._compare is not None:
             compare = self._compare
