@@ -8,23 +8,25 @@ from pathlib import Path
 import re
 import sys
 
-DOCS = Path(__file__).resolve().parent
+# rosdoc2 executes this text from a file in another folder, which names this file.
+named = re.search(r'exec\(open\("([^"]+)"\)', Path(__file__).read_text(encoding='utf-8'))
+DOCS = Path(named[1] if named else __file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
-# rosdoc2 runs this text in a folder of its own, and sets the version itself.
-manifest = DOCS.parent / 'package.xml'
-found = manifest.is_file() and re.search(
-    r'<version>(.*?)</version>', manifest.read_text(encoding='utf-8')
-)
+manifest = (DOCS.parent / 'package.xml').read_text(encoding='utf-8')
 project = 'rs_relpose_ros'
 project_copyright = 'rs_relpose_ros maintainers, Apache-2.0'
-release = version = found[1] if found else ''
+release = version = re.search(r'<version>(.*?)</version>', manifest)[1]
 
 # numpydoc is the better reader of these docstrings; napoleon comes with Sphinx.
 reader = 'numpydoc' if find_spec('numpydoc') else 'sphinx.ext.napoleon'
 extensions = ['myst_parser', 'sphinx.ext.autodoc', reader]
 root_doc = 'index'
-exclude_patterns = ['_build', 'front.md']
+# What rosdoc2 adds: copies of the README, whose links hold in the repository only, and pages of
+# all modules, which are internal. api.md has the public names.
+added = ['standard*', '__*_include.rst', 'modules.rst', 'rs_relpose_ros*.rst']
+exclude_patterns = ['_build', 'front.md', *added]
+rosdoc2_settings = {'override_theme': False}
 source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
 suppress_warnings = ['myst.strikethrough']
 
