@@ -469,7 +469,7 @@ def few_pairs() -> tuple[model.Problem, model.Unknowns, Truth]:
         np.array(truth.gyro_bias),
         noise=1.0,
     )
-    unknowns.parameters[model.LENS] = 0.01, 0.003, 0.02, -0.01, 0.005, 1.0, -2.0
+    unknowns.parameters[model.LENS] = 0.01, 0.003, 0.02, -0.01, 0.005, 0.001, -0.002, 1.0, -2.0
     return problem, unknowns, truth
 
 
@@ -481,10 +481,10 @@ def test_a_step_of_the_axes_turns_the_camera_and_that_of_the_lens_is_true_minus_
     turned = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ unknowns.R_cam_imu
     np.testing.assert_allclose(stepped(unknowns, step).R_cam_imu, turned, atol=1e-12)
     camera = camera_of(truth)
-    moved = camera.moved_lens(np.array([0.1, 0.0, 0.02, 0.0, 0.0, 3.0, -4.0]))
+    moved = camera.moved_lens(np.array([0.1, 0.0, 0.02, 0.0, 0.0, 0.001, -0.002, 3.0, -4.0]))
     assert moved.fx == pytest.approx(camera.fx * math.exp(0.1))
     assert (moved.cx - camera.cx, moved.cy - camera.cy) == pytest.approx((3.0, -4.0))
-    assert moved.distortion[0] == pytest.approx(0.02)
+    assert moved.distortion[:4] == pytest.approx((0.02, 0.0, 0.001, -0.002))
 
 
 def test_gradient_is_that_of_finite_differences():
@@ -1069,7 +1069,7 @@ def repeated_fits(offsets: list[float]) -> list[Fit]:
 
 def test_recordings_that_agree_share_their_doubts_and_average_their_noise():
     fits = repeated_fits([0.05] * 4)
-    found = combined(fits, np.zeros((4, 7)), 0)
+    found = combined(fits, np.zeros((4, 9)), 0)
     alone = fits[0].covariance
     together = found.fit.covariance
     assert not found.between.any()
@@ -1084,7 +1084,7 @@ def test_sigma_of_a_value_that_differs_between_recordings_covers_another_one():
     inside = 0
     for _ in range(200):
         offsets = 0.05 + 1.5e-3 * rng.standard_normal(5)
-        found = combined(repeated_fits(list(offsets[:4])), np.zeros((4, 7)), 1)
+        found = combined(repeated_fits(list(offsets[:4])), np.zeros((4, 9)), 1)
         sigma = math.sqrt(found.fit.covariance[OFFSET, OFFSET])
         inside += abs(offsets[4] - found.fit.unknowns.parameters[OFFSET]) < sigma
     # 68.3 % with a standard error of 3.3 %.
@@ -1096,7 +1096,7 @@ def test_axes_of_recordings_are_averaged_as_rotations():
     turn = Rotation.from_rotvec([0.002, 0.0, -0.004]).as_matrix()
     R = first.unknowns.R_cam_imu
     second = dataclasses.replace(second, unknowns=second.unknowns._replace(R_cam_imu=turn @ R))
-    found = combined([first, second], np.zeros((2, 7)), 0)
+    found = combined([first, second], np.zeros((2, 9)), 0)
     half = Rotation.from_matrix(found.fit.unknowns.R_cam_imu @ R.T).as_rotvec()
     np.testing.assert_allclose(half, [0.001, 0.0, -0.002], atol=2e-5)
 

@@ -69,6 +69,7 @@ SCALE = LIVE.part('gyro_scale')
 SKEW = LIVE.part('gyro_skew')
 FOCAL, ASPECT = map(LIVE.index, ('focal_log', 'aspect'))
 DISTORTION = LIVE.part('distortion')
+TANGENTIAL = LIVE.part('tangential')
 CENTER = LIVE.part('principal_point')
 DEVIATIONS = LIVE.size
 MS = 1_000_000
@@ -88,16 +89,18 @@ CAMERA = RollingShutterCamera(
 PARAMETERS = Parameters.from_mapping(
     {'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())}
 )
-# Small deviations: rad, s, s, rad/s, -, rad, -, -, shapes of the lens, widths.
+# Small deviations: rad, s, s, rad/s, -, rad, -, -, shapes of the lens, p1 and p2, widths. Axes, p2
+# and principal point nearly cancel each other: those are the largest.
 SMALL = np.array(
-    [3e-3] * 3
+    [4.5e-3] * 3
     + [2e-3, 2e-3]
     + [3e-3] * 3
-    + [5e-3] * 3
+    + [6e-3] * 3
     + [5e-3] * 3
     + [0.01, 0.01]
     + [0.01, 0.02, 0.02]
-    + [3e-3] * 2
+    + [2e-3] * 2
+    + [5.5e-3] * 2
 )
 CONFIGURED = Configured(
     PARAMETERS.sensor,
@@ -170,7 +173,7 @@ def deviating(camera, c):
     signed = camera.line_delay * camera.height + c[READOUT]
     coefficients = independent_shapes(corner_radius(camera)) @ c[DISTORTION]
     center = camera.width * c[CENTER]
-    lens = np.concatenate([[c[FOCAL], c[ASPECT]], coefficients, center])
+    lens = np.concatenate([[c[FOCAL], c[ASPECT]], coefficients, c[TANGENTIAL], center])
     return replace(
         camera.moved_lens(lens),
         readout_time=abs(signed),
@@ -230,7 +233,7 @@ def test_pairs_are_exact_at_times_that_are_far_off():
 
 @pytest.mark.parametrize(
     'signs',
-    [*np.eye(DEVIATIONS), [0.5, -0.5, 0.5] * 7],
+    [*np.eye(DEVIATIONS), np.resize([0.5, -0.5, 0.5], DEVIATIONS)],
     ids=[*map(str, range(DEVIATIONS)), 'all'],
 )
 def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
@@ -799,6 +802,7 @@ SIGMA = np.array(
     + [1e-3] * 3
     + [5e-3] * 2
     + [0.01] * 3
+    + [2e-4] * 2
     + [1e-3] * 2
 )
 # Ten sigmas of a deviation turn a pose by its own sigma.
@@ -928,7 +932,7 @@ def test_squeezed_images_are_named_with_both_focal_lengths(wrong, named):
     np.testing.assert_allclose(found.deviation, c, atol=1e-3)
     (fault,) = assessed(calibration(c, SIGMA), EACH).faults
     assert fault.code == named
-    right = CAMERA.moved_lens(np.array([c[FOCAL], c[ASPECT], *np.zeros(5)]))
+    right = CAMERA.moved_lens(np.array([c[FOCAL], c[ASPECT], *np.zeros(7)]))
     lengths = (right.fx, right.fy) if named == 'aspect' else (right.fx,)
     np.testing.assert_allclose(fault.estimated, lengths, rtol=1e-3)
     assert ('the images are squeezed' in text_of(fault).fix) is (named == 'aspect')
@@ -996,8 +1000,8 @@ def test_configured_sigmas_bound_what_a_deviation_may_explain():
     assert small[ASPECT] == ASPECT_SIGMA
     given = [0, 1, 2, OFFSET, READOUT, *range(FOCAL, DEVIATIONS)]
     np.testing.assert_allclose(doubt[given], small[given])
-    # Of nine quantities two are not known: the odds are 2 to 9 that one of them is off.
-    np.testing.assert_allclose(doubt[SCALE], math.sqrt(2 / 11) * LIVE.sigmas[SCALE])
+    # Of ten quantities two are not known: the odds are 2 to 10 that one of them is off.
+    np.testing.assert_allclose(doubt[SCALE], math.sqrt(2 / 12) * LIVE.sigmas[SCALE])
 
 
 @pytest.mark.parametrize('size, row', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])

@@ -129,10 +129,10 @@ def contradiction(data: Observations, final: fit.Fit) -> float:
 
 
 def _distances(off: Array, prior: Array) -> list[float]:
-    """Distances of the entries of the lens (7,) from their claims, in sigmas of the prior."""
+    """Distances of the entries of the lens (9,) from their claims, in sigmas of the prior."""
     found = []
     first = model.LENS.start
-    for name in ('focal_log', 'aspect', 'distortion', 'principal_point'):
+    for name in ('focal_log', 'aspect', 'distortion', 'tangential', 'principal_point'):
         part = OFFLINE.part(name)
         own = slice(part.start - first, part.stop - first)
         square = float(off[own] @ np.linalg.solve(prior[own, own], off[own]))

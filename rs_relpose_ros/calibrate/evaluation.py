@@ -210,10 +210,12 @@ def _against_claims(data: Observations, parameters: Array, covariance: Array) ->
     """
     camera = data.camera.moved_lens(parameters[model.LENS])
     coefficients = ', '.join(f'{one:.3f}' for one in camera.radial_coefficients)
+    sideways = ', '.join(f'{one:.4f}' for one in camera.tangential_coefficients)
     values = {
         'focal_log': f'a focal length of {camera.fx:.1f} px',
         'aspect': f'focal lengths fx {camera.fx:.1f} and fy {camera.fy:.1f} px',
         'distortion': f'a distortion k1, k2, k3 of {coefficients}',
+        'tangential': f'tangential coefficients p1, p2 of {sideways}',
         'principal_point': f'a principal point of {camera.cx:.1f}, {camera.cy:.1f} px',
     }
     off = np.zeros(model.GLOBAL)

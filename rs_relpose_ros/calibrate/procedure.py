@@ -57,9 +57,10 @@ _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 # Neighbouring frames, whose rotation is compared with the gyro.
 _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
-# Changes of the lens within which the fit is linear in it: focal length, aspect, coefficients,
-# principal point [px]. [chosen: the error of second order is below 0.1 px there]
-_LENS_STAYS = (0.01, 0.01, 0.02, 0.05, 0.05, 5.0, 5.0)
+# Changes of the lens within which the fit is linear in it: focal length, aspect, radial and
+# tangential coefficients, principal point [px]. [chosen: the error of second order is below 0.1 px
+# there]
+_LENS_STAYS = (0.01, 0.01, 0.02, 0.05, 0.05, 0.01, 0.01, 5.0, 5.0)
 # Largest number of fits, each about its own lens. [chosen: two or three are usual]
 _LENS_ROUNDS = 6
 # Sigma of an angle that is not known [rad].

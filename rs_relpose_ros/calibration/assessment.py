@@ -29,7 +29,14 @@ from rs_relpose_ros.calibration.findings import (
 from rs_relpose_ros.calibration.posterior import Calibration, OF_LENS, PairData
 from rs_relpose_ros.calibration.rotations import RotationComparison
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.core.deviations import ASPECT_SIGMA, LIVE
+from rs_relpose_ros.core.deviations import (
+    ASPECT_SIGMA,
+    by_name,
+    LENS,
+    LIVE,
+    PARTS,
+    TANGENTIAL_SIGMA,
+)
 from rs_relpose_ros.core.least_squares import inverse, log_determinant
 from rs_relpose_ros.core.radial import corner_radius, displacements, independent_sigmas
 from rs_relpose_ros.geometry import Array
@@ -135,6 +142,8 @@ def configured_sigmas(
     sigmas[LIVE.part('distortion')] = independent_sigmas(
         corner_radius(camera), configured['distortion']
     )
+    if configured['distortion']:
+        sigmas[LIVE.part('tangential')] = TANGENTIAL_SIGMA
     sigmas[LIVE.part('principal_point')] /= camera.width
     if configured['focal_log']:
         sigmas[LIVE.part('aspect')] = ASPECT_SIGMA
@@ -540,10 +549,10 @@ def _setting(found: Finding, left: Array, configured: Configured) -> dict[str, A
         return {'gyro_bias': findings.rounded(found.estimated)}
     if found.code in (Code.TIME_OFFSET, Code.READOUT_TIME):
         return {found.code.value: found.estimate}
-    if found.code is Code.DISTORTION:
-        camera = configured.camera
-        change = np.subtract(found.estimated, found.configured)
-        right = camera.moved_lens(np.concatenate([[0.0, 0.0], change, [0.0, 0.0]]))
+    if found.code in (Code.DISTORTION, Code.TANGENTIAL):
+        change = by_name()
+        change[PARTS[found.code.value]] = np.subtract(found.estimated, found.configured)
+        right = configured.camera.moved_lens(change[LENS])
         return {'distortion_coefficients': findings.rounded(right.distortion)}
     return {}
 
@@ -658,7 +667,8 @@ def _rotation_errors(rotations: RotationComparison, configured: Configured) -> I
     """Axes, unit and flips, from the rotations of images and gyro."""
     explained = min(rotations.left_at_best, rotations.left_mirrored)
     if explained < _EXPLAINED_AT_BEST:
-        if rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR:
+        is_other_unit = rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR
+        if is_other_unit or rotations.has_other_factor:
             yield Finding(
                 Code.GYRO_UNIT, FindingState.WRONG, Why.GROSS, (1.0,), (rotations.scale,)
             )

@@ -13,17 +13,14 @@ from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes seconds to import, at the start of a node
 
 from rs_relpose_ros.calibration.fit import (
-    evaluate,
     evaluation,
     Fit,
     Flags,
     minimised,
     MOST_ROUNDS,
-    normal_equations,
     sums_of,
     TOLERANCE,
 )
-from rs_relpose_ros.calibration.knowledge import TANGENTIAL_SIGMA
 from rs_relpose_ros.calibration.model import GLOBAL, Problem, Unknowns
 from rs_relpose_ros.core.least_squares import adjusted_scores, inverse, JACKKNIFE
 from rs_relpose_ros.geometry import Array
@@ -304,8 +301,7 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
     The variance by the matches is the largest of three: that of the model, of the jackknife over
     blocks of time (both are in the covariance of `fit`), and of that over regions of the image.
     The errors of the priors, which recordings of one camera share, are no scatter.
-    `in_images` is whether a tracker followed the points: its own errors, and p1 and p2 of the
-    lens, which no fit estimates, are added.
+    `in_images` is whether a tracker followed the points: its own errors are added.
     """
     free, block = final.free, final.block
     by_prior = _by_prior(final)
@@ -314,16 +310,13 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
     regions = np.ones(GLOBAL)
     regions[free] = of_image / np.diag(covariance)[free]
     covariance[block] = _widened_to(covariance[block], of_image)
-    by_tangential = np.zeros((GLOBAL, 2))
     if in_images:
-        by_tangential[free] = _by_tangential(final, TANGENTIAL_SIGMA)
         covariance *= 1.0 + _SHARED**2 * final.problem.pairs
-    by_doubt = np.hstack([by_prior, by_tangential])
     variance = float(final.problem.weight.mean()) / bent(final.weights)
     return replace(
         final,
-        covariance=covariance + by_doubt @ by_doubt.T,
-        by_doubt=by_doubt,
+        covariance=covariance + by_prior @ by_prior.T,
+        by_doubt=by_prior,
         halves_apart=Groups.of_time(final).halves_apart(variance),
         regions=regions,
     )
@@ -340,31 +333,6 @@ def _by_prior(final: Fit) -> Array:
     moves = np.zeros((GLOBAL, GLOBAL))
     moves[final.block] = inverse(_hessian(final)) @ root
     return moves
-
-
-# Share of a doubt for which derivatives are differences. [chosen: residuals change by less than
-# their noise, and more than by rounding; any value in 1e-4..0.1 would do]
-_SMALL = 0.01
-
-
-def _by_tangential(final: Fit, sigma: float) -> Array:
-    """Moves (k, 2) of the free parameters by one sigma of p1 and of p2."""
-    problem, unknowns, free = final.problem, final.unknowns, final.free
-    H, _ = normal_equations(problem, final.evaluation, unknowns, free)
-    x = problem.points[..., 0]
-    y = problem.points[..., 1]
-    mixed = 2.0 * x * y
-    squares = x * x + y * y
-    by_p1 = np.stack([mixed, squares + 2.0 * y * y], axis=-1)
-    by_p2 = np.stack([squares + 2.0 * x * x, mixed], axis=-1)
-    here = final.evaluation.score.sum(axis=0)
-    gradients = np.empty((len(here), 2))
-    step = _SMALL * sigma
-    for k, displacement in enumerate((by_p1, by_p2)):
-        moved = problem._replace(points=problem.points - step * displacement)
-        there = evaluate(moved, unknowns, free)
-        gradients[:, k] = (there.score.sum(axis=0) - here) / _SMALL
-    return np.asarray(np.linalg.solve(H, gradients))
 
 
 def _regions(points: Array) -> NDArray[np.int64]:

@@ -34,6 +34,9 @@ LARGEST_READOUT = 0.01
 # of 2 %, a smaller one would not report that of weak motion.
 # [chosen: 0.05 of k1 in an image of 640x480 with a focal length of 500 px]
 _OBSERVABLE_DISPLACEMENT = 0.03
+# Largest sigma of p1 and p2 with which they count as observable. A larger one would report what
+# nothing determines but their prior, 0.002. [chosen: three quarters of the prior]
+_OBSERVABLE_TANGENTIAL = 1.5e-3
 
 
 class FindingState(str, Enum):
@@ -62,6 +65,7 @@ class Code(str, Enum):
     FOCAL_LENGTH = 'focal_length'
     ASPECT = 'aspect'
     DISTORTION = 'distortion'
+    TANGENTIAL = 'tangential'
     PRINCIPAL_POINT = 'principal_point'
     # Further causes that the consistency monitor names.
     READOUT_DIRECTION = 'readout_direction'
@@ -273,8 +277,9 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
 
     If `now` has a gross error, masks a part of the image, or has a change of the offset or pairs
     without an explanation, and `before` had not, earlier findings were its traces and are dropped.
-    So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`), and a
-    pattern of residuals once anything else is found, which explains it. Of what is masked, the
+    So is a parameter that few pairs made suspect and more pairs do not (`_is_trace`), one of
+    several candidates of which another one is named alone by now (`_is_ruled_out`), and a pattern
+    of residuals once anything else is found, which explains it. Of what is masked, the
     later finding has the extent.
     """
     traces = (
@@ -294,7 +299,8 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
     order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
     for one in now.findings:
         known = found.setdefault(one.code, one)
-        if order.index(known.state) <= order.index(one.state) or _is_trace(known, one, now):
+        is_over = _is_trace(known, one, now) or _is_ruled_out(known, one, now)
+        if order.index(known.state) <= order.index(one.state) or is_over:
             found[one.code] = one
     return Assessment(tuple(found.values()))
 
@@ -314,6 +320,13 @@ def _is_trace(earlier: Finding, later: Finding, now: Assessment) -> bool:
         one.why is Why.OFF and (one.evidence.pairs or 0) >= _OVERRULES * few for one in now.faults
     )
     return by_more and later.why in (Why.CONSISTENT, Why.OTHER_INCONSISTENT)
+
+
+def _is_ruled_out(earlier: Finding, later: Finding, now: Assessment) -> bool:
+    """Whether a candidate is none any more, as another one of them is named alone."""
+    others = set(earlier.candidates) - {earlier.code}
+    named = {one.code for one in now.faults if one.why is Why.OFF and not one.candidates}
+    return later.state in (FindingState.OK, FindingState.UNKNOWN) and bool(others & named)
 
 
 def rounded(values: ArrayLike, digits: int = 5) -> list[float]:
@@ -420,6 +433,10 @@ def _logarithms(configured: Configured) -> Array:
 
 def _coefficients(configured: Configured, left: Array) -> Array:
     return np.asarray(configured.camera.radial_coefficients + left)
+
+
+def _tangential(configured: Configured, left: Array) -> Array:
+    return np.asarray(configured.camera.tangential_coefficients + left)
 
 
 def _coefficient_shapes(configured: Configured) -> Array:
@@ -561,6 +578,21 @@ QUANTITIES = (
         _coefficients,
         shapes=_coefficient_shapes,
         uncertainty=_corner_sigma,
+    ),
+    Quantity(
+        Code.TANGENTIAL,
+        'tangential',
+        _OBSERVABLE_TANGENTIAL,
+        '',
+        Shown(
+            '',
+            1.0,
+            4,
+            'p1, p2: ' + COMPARED,
+            'set distortion_coefficients: {} with the camera_matrix, or calibrate the lens',
+        ),
+        _tangential,
+        alone=True,
     ),
     Quantity(
         Code.PRINCIPAL_POINT,

@@ -9,6 +9,7 @@ an entry in `findings.QUANTITIES` instead, and has the texts of the others.
 
 from collections.abc import Callable, Mapping
 import json
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,12 @@ _LONGEST = 100_000
 # Rotation of axes [deg] below which the gyro itself may be misaligned. [chosen: data sheets state
 # up to a degree]
 _MISALIGNED = 1.0
+# Difference of the logarithm of a factor within which it is pi / 180. A smaller one would not
+# allow for what wrong tracks take from the images' rotation, a larger one would include other
+# units. [measured: 0.23 on a walk with a gyro in deg/s, which predicts no point of the tracks]
+_ONE_UNIT = 0.4
+# Least factor, of which a logarithm is taken. [derived: above zero, and below that of any unit]
+_LEAST_FACTOR = 1e-9
 
 
 class Text(NamedTuple):
@@ -196,10 +203,16 @@ def _by_columns(finding: Finding) -> Text:
 
 
 def _other_unit(finding: Finding) -> Text:
-    return Text(
-        f'images rotate {finding.estimate:.3g} times as far as the gyro',
-        'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
+    factor = finding.estimate
+    assert factor is not None
+    is_degree = abs(math.log(max(factor, _LEAST_FACTOR) / math.radians(1.0))) < _ONE_UNIT
+    fix = (
+        'publish rad/s, which is pi / 180 = 0.0175 times deg/s'
+        if is_degree
+        else 'publish rad/s: verify the unit and the full-scale range of the driver, whose rates '
+        f'have to be multiplied by about {factor:.2g}'
     )
+    return Text(f'images rotate {factor:.3g} times as far as the gyro', fix)
 
 
 def _left_handed(finding: Finding) -> Text:

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from rs_relpose_ros.calibration import model
-from rs_relpose_ros.core.deviations import ASPECT_SIGMA, OFFLINE
+from rs_relpose_ros.core.deviations import ASPECT_SIGMA, OFFLINE, TANGENTIAL_SIGMA
 from rs_relpose_ros.core.radial import corner_radius, prior_covariance
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -17,8 +17,8 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 # Parameters of the lens that are estimated if it is not known.
 LENS = OFFLINE.mask('focal_log', 'distortion', 'principal_point')
 # Parameters that every recording from images may contradict: the claims of a CameraInfo, square
-# pixels, and the axes of a gyro.
-CLAIMED = LENS | OFFLINE.mask('aspect', 'gyro_scale', 'gyro_skew')
+# pixels, a lens that is centred, and the axes of a gyro.
+CLAIMED = LENS | OFFLINE.mask('aspect', 'tangential', 'gyro_scale', 'gyro_skew')
 
 
 class LensKnowledge(str, Enum):
@@ -43,9 +43,6 @@ _CENTER_SIGMA = 0.015
 # 1 sigma of the first coefficient of the distortion of a lens of which nothing is known.
 # [chosen: wide lenses have -0.3]
 _RADIAL_SIGMA = 0.3
-# 1 sigma of the tangential coefficients p1 and p2, which no fit estimates. A larger one would
-# dominate the doubt of the axes. [chosen: what a calibration by a target leaves]
-TANGENTIAL_SIGMA = 5e-4
 # 1 sigma of the scale of each axis of the gyro. [chosen: data sheets of MEMS gyros after the
 # compensation of the manufacturer]
 _SCALE_SIGMA = 0.005
@@ -84,6 +81,7 @@ def prior_information(
     sigmas[model.SCALE] = _SCALE_SIGMA
     sigmas[model.SKEW] = _SKEW_SIGMA
     sigmas[model.ASPECT] = ASPECT_SIGMA
+    sigmas[model.TANGENTIAL] = TANGENTIAL_SIGMA
     of_center = _CENTER_SIGMA
     if lens is LensKnowledge.CLAIMED:
         sigmas[model.FOCAL] = _FOCAL_SIGMA
@@ -98,6 +96,6 @@ def prior_information(
 
 
 def prior_covariance_of_lens(camera: RollingShutterCamera) -> Array:
-    """Covariance (7, 7) of a claimed lens about its claims, before the fit."""
+    """Covariance (9, 9) of a claimed lens about its claims, before the fit."""
     information = prior_information(camera, LensKnowledge.CLAIMED, 0.0)
     return np.asarray(np.linalg.inv(information[model.LENS, model.LENS]))

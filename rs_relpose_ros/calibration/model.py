@@ -73,6 +73,8 @@ FOCAL = OFFLINE.index('focal_log')
 ASPECT = OFFLINE.index('aspect')
 # Coefficients k1, k2, k3.
 DISTORTION = OFFLINE.part('distortion')
+# Coefficients p1, p2.
+TANGENTIAL = OFFLINE.part('tangential')
 # Principal point [px].
 CENTER = OFFLINE.part('principal_point')
 # Square of the exposure beyond the assumed one [s^2].
@@ -119,8 +121,8 @@ class Problem(NamedTuple):
     rows: Array  # (2, N) s(v) of the raw rows
     points: Array  # (2, N, 2) undistorted and normalised with the assumed camera
     by_pixel: Array  # (2, N, 2, 2) derivative of the normalised point by the pixel
-    by_lens: Array  # (2, N, 2, 7) derivative of the normalised point by the lens
-    by_pixel_by_lens: Array  # (2, N, 2, 2, 7) derivative of `by_pixel` by the lens
+    by_lens: Array  # (2, N, 2, 9) derivative of the normalised point by the lens
+    by_pixel_by_lens: Array  # (2, N, 2, 2, 9) derivative of `by_pixel` by the lens
     bend_sigma: Array  # (P,) 1 sigma of each component of `bend`
     turn_sigma: Array  # (P,) 1 sigma of each component of `turn` [rad]
     prior: Array  # (GLOBAL, GLOBAL) information of the parameters before the fit

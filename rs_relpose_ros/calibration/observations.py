@@ -276,7 +276,7 @@ class Observations:
 
     tracks: TrackedPoints  # of points that the camera model can map to rays
     camera: RollingShutterCamera  # as assumed, moved by `lens`; its readout time is not used
-    lens: Array  # (7,) parameters `model.LENS`
+    lens: Array  # (9,) parameters `model.LENS`
     knowledge: LensKnowledge  # where the camera comes from
     times: Array  # (F,) stamps of the frames [s]
     stamps: FrameTimes

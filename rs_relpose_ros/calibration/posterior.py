@@ -245,7 +245,7 @@ class FrameRows(NamedTuple):
     views: Array  # (N, 3, 3) ray and its derivatives by u and v, in axes of the middle row
     times: Array  # (N,) of the rows after the middle row [s]
     states: RowStates  # rotation of the views on the left, and delay of the times
-    views_by_lens: Array  # (N, 3, 3, 7)
+    views_by_lens: Array  # (N, 3, 3, 9)
 
 
 def frame_rows(pair: PairData, problem: TwoViewProblem, image: int, at: Array) -> FrameRows:

@@ -44,7 +44,7 @@ class _Own(NamedTuple):
 def combined(
     fits: Sequence[Fit], lenses: Array, reference: int, intervals: Array | None = None
 ) -> Repeated:
-    """Combine at least two fits; `lenses` (N, 7) are the lenses about which each was fitted.
+    """Combine at least two fits; `lenses` (N, 9) are the lenses about which each was fitted.
 
     `intervals` (N,) are the median intervals between frames [s], at which the offset of each fit
     is. The offset of the result is that at the interval of `reference`, and its lens is about that

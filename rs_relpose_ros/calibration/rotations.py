@@ -70,6 +70,14 @@ _LEFT_AT_OFFSET = 0.4
 # are apart for axes. [measured: .01 to .22 on two walks with axes turned by 90 and 180 deg, .4 to
 # .9 with clocks that are .3 to .6 s apart]
 _LEFT_IF_TURNED = 0.3
+# Logarithm of a factor of the gyro beyond which it is no scale of a sensor. A smaller one would
+# take what translation adds to the images' rotation for a factor, a larger one would miss the next
+# full-scale range, which is 2. [chosen: 1.5 times; 1.4 to 1.7 would do]
+_OTHER_FACTOR = 0.4
+# Difference between the logarithms of two such factors that are one. A smaller one would not allow
+# for translation, a larger one would take a focal length of twice the value for a factor, which
+# leaves the rotation about the optical axis as it is. [chosen: 0.2 to 0.5 would do]
+_ALIKE = 0.35
 # Rotations that an offset has to compare. Fewer agree by chance. [chosen: 2 to 3 s]
 _FEWEST_AT_OFFSET = 25
 
@@ -107,12 +115,28 @@ class RotationComparison:
     rotation: Array  # (3, 3) Q: the true gyro is Q times the configured one
     reflection: Array  # (3, 3) the best one
     scale: float  # images over gyro, after `rotation`
+    # Images over gyro without any rotation: about the optical axis, and across it. A wrong focal
+    # length changes the second one alone.
+    scale_along: float
+    scale_across: float
     by_gyro: float  # [rad] sum of the angles
     count: int
     # At the best of other time offsets, no rotation; infinite if too little turned to try them.
     left_at_offset: float
     # Time offset [s], if the rotations agree there, and at no other one, without any rotation.
     offset: float | None
+
+    @property
+    def has_other_factor(self) -> bool:
+        """Whether all axes of the gyro have one factor that no calibration of a gyro has."""
+        if self.count < _FEWEST_AT_OFFSET or self.by_gyro < _ENOUGH_TO_RELATE:
+            return False
+        scales = np.array([self.scale_along, self.scale_across])
+        if self.left_as_configured > _LEFT_AT_OFFSET or (scales <= 0.0).any():
+            return False
+        logarithms = np.log(scales)
+        is_alike = abs(logarithms[0] - logarithms[1]) < _ALIKE
+        return bool(is_alike and np.abs(logarithms).min() > _OTHER_FACTOR)
 
     @property
     def is_at_another_time(self) -> bool:
@@ -207,11 +231,18 @@ class RotationSums(LastSeconds):
             np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt),
             np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
             trace / max(float((phi**2).sum()), _NO_ROTATION),
+            _factor(theta[:, 2:], phi[:, 2:]),
+            _factor(theta[:, :2], phi[:, :2]),
             by_gyro,
             len(self),
             left_at_offset,
             offset,
         )
+
+
+def _factor(theta: Array, phi: Array) -> float:
+    """Components (N, M) of the images' rotations over those of the gyro."""
+    return float((theta * phi).sum()) / max(float((phi**2).sum()), _NO_ROTATION)
 
 
 def _without_rate(rotations: Array, intervals: Array) -> Array:

@@ -52,13 +52,15 @@ ENTRIES = (
     Entry('gyro_skew', 3, 'rad', 0.005, 0.02),
     # Square of the exposure time, over which the rates of the gyro are averaged.
     Entry('exposure_square', 1, 's^2', 1e-4, 1e-3),
-    # The next four are those of `geometry.lens`, in its order. f_true = f exp(c), both.
+    # The next five are those of `geometry.lens`, in its order. f_true = f exp(c), both.
     Entry('focal_log', 1, '', 0.3, 0.45),
     # fy / fx, true = configured exp(c): of images that were resized along one axis alone.
     Entry('aspect', 1, '', 0.2, 0.35),
     # Coefficients k1, k2, k3 in the whole vector. Where `Selection.of_camera` is applied, values
     # of `radial.independent_shapes`, of which the first one is k1 alone.
     Entry('distortion', 3, '', WRONG_SIGMA, 0.6),
+    # Coefficients p1 and p2 of a lens that is not centred on the sensor, or tilted against it.
+    Entry('tangential', 2, '', 2e-3, 0.02),
     # [px] in the whole vector, in widths of the image where `Selection.of_camera` is applied.
     Entry('principal_point', 2, 'width', 0.015, 0.1),
 )
@@ -67,6 +69,9 @@ ENTRIES = (
 # are not quite square, a larger one would widen poses for what calibrations exclude.
 # [chosen: pixels are square; any value in 0.001..0.005 would do]
 ASPECT_SIGMA = 0.002
+# 1 sigma of the tangential coefficients p1 and p2 of a lens that is known. A larger one would
+# dominate the doubt of the axes. [chosen: what a calibration by a target leaves]
+TANGENTIAL_SIGMA = 5e-4
 
 
 def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
@@ -166,6 +171,7 @@ LIVE = Selection.of(
     'focal_log',
     'aspect',
     'distortion',
+    'tangential',
     'principal_point',
 )
 # Deviations of the calibration of a recording: all. Those that it does not estimate are doubts.

@@ -242,7 +242,7 @@ class RollingShutterCamera:
     def unproject_by_lens(self, points: ArrayLike) -> tuple[Array, Array, Array]:
         """Unit rays (N, 3), with their derivatives by the pixel and by the lens.
 
-        These are (N, 3, 2), and (N, 3, 7) in the order of `geometry.lens.LENS_ENTRIES`.
+        These are (N, 3, 2), and (N, 3, 9) in the order of `geometry.lens.LENS_ENTRIES`.
         """
         distorted = self._distorted(points)
         normalized, by_distorted = self._undistorted(distorted)
@@ -266,7 +266,7 @@ class RollingShutterCamera:
         return rays_by_lens(self.points_by_lens(points))
 
     def moved_lens(self, deviation: Array) -> 'RollingShutterCamera':
-        """Camera whose lens deviates by `deviation` (7,), in the order of `LENS_ENTRIES`."""
+        """Camera whose lens deviates by `deviation` (9,), in the order of `LENS_ENTRIES`."""
         focal_log, aspect = deviation[:2].tolist()
         cx, cy = deviation[-2:].tolist()
         return replace(
@@ -282,6 +282,11 @@ class RollingShutterCamera:
     def radial_coefficients(self) -> Array:
         """Coefficients (3,) k1, k2, k3 of the distortion."""
         return self._compiled.radial[:3].copy()
+
+    @property
+    def tangential_coefficients(self) -> Array:
+        """Coefficients (2,) p1, p2 of the distortion."""
+        return self._compiled.sideways[:2]
 
     def _distorted(self, points: ArrayLike) -> Array:
         """Normalised points (N, 2) of raw pixels (N, 2), before the distortion is removed."""

@@ -29,26 +29,36 @@ from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
 
 # Entries of a deviation of the lens (true minus assumed) and their sizes, in the order of all
 # derivatives by the lens: logarithm of both focal lengths; logarithm of fy / fx, which moves fy;
-# radial coefficients k1, k2, k3; principal point cx, cy [px]. [chosen: the order of
-# `core.deviations`]
-LENS_ENTRIES = (('focal_log', 1), ('aspect', 1), ('distortion', 3), ('principal_point', 2))
+# radial coefficients k1, k2, k3; tangential coefficients p1, p2; principal point cx, cy [px].
+# [chosen: the order of `core.deviations`]
+LENS_ENTRIES = (
+    ('focal_log', 1),
+    ('aspect', 1),
+    ('distortion', 3),
+    ('tangential', 2),
+    ('principal_point', 2),
+)
 # Number of values of a deviation of the lens. [derived: sum of the sizes above]
-N_LENS = 7
+N_LENS = 9
 # Number of the radial coefficients that have derivatives. [derived: size of 'distortion']
 _N_RADIAL = 3
+# Place of the first tangential coefficient. [derived: the sizes before it]
+_TANGENTIAL = 5
+# Place of the principal point. [derived: the sizes before it]
+_CENTER = 7
 
 
 class ByLens(NamedTuple):
     """What pixels see, as vectors of C components, and its derivatives.
 
-    The vectors are unit rays (C = 3) or normalised points (C = 2). The last axis of size 7 has the
+    The vectors are unit rays (C = 3) or normalised points (C = 2). The last axis of size 9 has the
     order of `LENS_ENTRIES`.
     """
 
     values: Array  # (N, C)
     by_pixel: Array  # (N, C, 2) [1/px]
-    by_lens: Array  # (N, C, 7)
-    by_pixel_by_lens: Array  # (N, C, 2, 7) derivative of `by_pixel` by the lens
+    by_lens: Array  # (N, C, 9)
+    by_pixel_by_lens: Array  # (N, C, 2, 9) derivative of `by_pixel` by the lens
 
 
 # -- Distortion models by name --------------------------------------------------------------------
@@ -147,6 +157,7 @@ class CompiledLens(NamedTuple):
     profile: int  # address of the compiled kernel of the radial profile
     radial: Array  # (6,) coefficients of the profile
     sideways: Array  # (6,) tangential p1, p2 and thin-prism s1, s2, s3, s4
+    bends_sideways: float  # 1, or 0 for a model without tangential coefficients
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,16 +182,19 @@ class DistortionModel:
         sideways = np.zeros(6)
         radial[: len(self.radial)] = given[list(self.radial)]
         sideways[: len(self.sideways)] = given[list(self.sideways)]
-        return CompiledLens(_PROFILE_KERNEL.address(self.profile), radial, sideways)
+        bends_sideways = 1.0 if self.sideways else 0.0
+        return CompiledLens(
+            _PROFILE_KERNEL.address(self.profile), radial, sideways, bends_sideways
+        )
 
     def moved(self, coefficients: tuple[float, ...], by: Array) -> tuple[float, ...]:
-        """Coefficients with `by` (3,) added to k1, k2, k3: as many as that needs.
+        """Coefficients with `by` (5,) added to k1, k2, k3, p1, p2: as many as that needs.
 
-        A model that has fewer radial coefficients ignores the rest of `by`.
+        A model that has fewer of them ignores the rest of `by`.
         """
-        steps = {
-            place: step for place, step in zip(self.radial, by.tolist(), strict=False) if step
-        }
+        of_radial = zip(self.radial, by[:_N_RADIAL].tolist(), strict=False)
+        of_tangential = zip(self.sideways, by[_N_RADIAL:].tolist(), strict=False)
+        steps = {place: step for place, step in (*of_radial, *of_tangential) if step}
         if not steps:
             return coefficients
         needed = max(len(coefficients), 1 + max(steps))
@@ -473,9 +487,16 @@ def _bends(x: float, y: float, lens: CompiledLens, profile: Array, out: Array) -
 
 @kernel
 def _write_both(
-    n: Array, A: Array, profile: Array, bends: Array, by_pixel: Array, by_lens: Array, out: Array
+    n: Array,
+    A: Array,
+    profile: Array,
+    bends: Array,
+    by_pixel: Array,
+    by_lens: Array,
+    bends_sideways: float,
+    out: Array,
 ) -> None:
-    """Write d2n / (du dq) of one point into `out` (2, 2, 7), as in `points_by_lens`."""
+    """Write d2n / (du dq) of one point into `out` (2, 2, 9), as in `points_by_lens`."""
     for u in range(2):
         P = by_pixel[:, u]
         along_n = _dot(n, P)
@@ -495,6 +516,12 @@ def _write_both(
                 gain = profile[_GAIN + 2 * m]
                 slope = profile[_GAIN + 1 + 2 * m]
                 out_cu[2 + m] -= gain * even + slope * along
+            # dJ/dp1 = 2 [[y, x], [x, 3 y]], dJ/dp2 = 2 [[3 x, y], [y, x]].
+            crossed = A[c, 0] * P[1] + A[c, 1] * P[0]
+            of_p1 = n[0] * crossed + n[1] * (A[c, 0] * P[0] + 3.0 * A[c, 1] * P[1])
+            of_p2 = n[1] * crossed + n[0] * (3.0 * A[c, 0] * P[0] + A[c, 1] * P[1])
+            out_cu[_TANGENTIAL] -= 2.0 * bends_sideways * of_p1
+            out_cu[_TANGENTIAL + 1] -= 2.0 * bends_sideways * of_p2
             # A longer focal length makes the step of a pixel smaller: A (d2d / (du dq)).
             out_cu[0] -= P[c]
             if u == 1:
@@ -509,7 +536,7 @@ def first_order_by_lens(
     focal: tuple[float, float],
     lens: CompiledLens,
 ) -> tuple[Array, Array]:
-    """Derivatives of normalised points n by the pixel (N, 2, 2) and by the lens (N, 2, 7).
+    """Derivatives of normalised points n by the pixel (N, 2, 2) and by the lens (N, 2, 9).
 
     `points` (N, 2) are undistorted, and `by_distorted` (N, 2, 2) are their derivatives A by the
     distorted points d (N, 2), both as of `undistort_points`; `focal` is (fx, fy) [px]. With
@@ -524,7 +551,11 @@ def first_order_by_lens(
         x = points[i, 0]
         y = points[i, 1]
         A = by_distorted[i]
-        profile_at(lens.profile, x * x + y * y, lens.radial, profile)
+        r2 = x * x + y * y
+        profile_at(lens.profile, r2, lens.radial, profile)
+        mixed = 2.0 * x * y * lens.bends_sideways
+        along_x = (r2 + 2.0 * x * x) * lens.bends_sideways
+        along_y = (r2 + 2.0 * y * y) * lens.bends_sideways
         for c in range(2):
             of_c = by_lens[i, c]
             toward = _dot(A[c], points[i])
@@ -532,10 +563,12 @@ def first_order_by_lens(
             of_c[1] = -A[c, 1] * distorted[i, 1]
             for m in range(_N_RADIAL):
                 of_c[2 + m] = -profile[_GAIN + 2 * m] * toward
+            of_c[_TANGENTIAL] = -(A[c, 0] * mixed + A[c, 1] * along_y)
+            of_c[_TANGENTIAL + 1] = -(A[c, 0] * along_x + A[c, 1] * mixed)
             for u in range(2):
                 step = A[c, u] / focal[u]
                 by_pixel[i, c, u] = step
-                of_c[2 + _N_RADIAL + u] = -step
+                of_c[_CENTER + u] = -step
     return by_pixel, by_lens
 
 
@@ -564,7 +597,16 @@ def points_by_lens(
         profile_at(lens.profile, x * x + y * y, lens.radial, profile)
         _bends(x, y, lens, profile, bends)
         A = by_distorted[i]
-        _write_both(points[i], A, profile, bends, by_pixel[i], by_lens[i], by_both[i])
+        _write_both(
+            points[i],
+            A,
+            profile,
+            bends,
+            by_pixel[i],
+            by_lens[i],
+            lens.bends_sideways,
+            by_both[i],
+        )
     return ByLens(points, by_pixel, by_lens, by_both)
 
 

@@ -53,6 +53,16 @@ class ImuSlice:
         return self._integrated[0]
 
     @property
+    def angle(self) -> Array:
+        """Integral (3,) of the angular velocity [rad], each in the axes of its own time.
+
+        It does not wrap, whatever the unit of the gyro, and is proportional to its scale.
+        """
+        steps = np.diff((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
+        means = 0.5 * (self.angular_velocities[1:] + self.angular_velocities[:-1])
+        return np.asarray(steps @ means)
+
+    @property
     def covariance(self) -> Array:
         """Covariance (3, 3) [rad^2] of the error of `rotation`; see `integrate_rotation`."""
         return self._integrated[1]

@@ -163,6 +163,11 @@ class ConsistencyMonitor:
         if not self._wrong_configuration:
             self.acceleration.add(stamp_ns, evidence)
 
+    @property
+    def has_other_unit(self) -> bool:
+        """Whether the gyro has another unit: all images contradict it, and none by an object."""
+        return any(one.code is Code.GYRO_UNIT for one in self._gross)
+
     def deviates_as_allowed(self, configured: Configured) -> bool:
         """Whether a parameter certainly deviates, but within its configured sigma.
 
@@ -343,6 +348,10 @@ class ConsistencyMonitor:
     def _add_others(self, stamp_ns: int) -> None:
         """Add the findings that do not depend on the parameters."""
         found = self.health.findings
+        if any(one.code is Code.GYRO_UNIT for one in found):
+            # Such a gyro turns gravity away, and has another noise. Parts of the image that it
+            # moves elsewhere seem still by chance.
+            return
         if (also := self.acceleration.finding()) is not None:
             found = (*found, also)
         found = (*found, *self._of_changes(stamp_ns))
@@ -350,10 +359,7 @@ class ConsistencyMonitor:
             found = (*found, self._noise)
         if self.jitter:
             found = (*found, assessment.jitter_of_stamps(self.jitter))
-        # A gyro of another unit moves images elsewhere: parts seem still by chance.
-        if not any(one.code is findings.Code.GYRO_UNIT for one in found):
-            found = (*found, *self.image_findings)
-        self.health = Assessment(found)
+        self.health = Assessment((*found, *self.image_findings))
 
     def _find_inconsistencies(self, configured: Configured) -> None:
         """Find which quantities are off, or change, by all pairs so far."""

@@ -28,7 +28,7 @@ from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.matches import Ids, Matches
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import log_so3, STANDARD_GRAVITY
+from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, ImuSlice
 from rs_relpose_ros.pipeline import pair
@@ -73,12 +73,12 @@ _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
 @dataclass(slots=True, eq=False)
 class _RotationStart:
-    """An image that later ones are compared with, and the gyro's rotation since."""
+    """An image that later ones are compared with, and the gyro's angle since."""
 
     stamp_ns: int
     ids: Ids  # (N,) of tracks
     rays: Array  # (N, 3) as measured
-    by_gyro: Array = field(default_factory=lambda: np.eye(3))
+    by_gyro: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [rad]
     frames: int = 0
 
 
@@ -188,7 +188,7 @@ class Pipeline(Processor[PairResult]):
             tracked_fraction=self._tracker.tracked_fraction,
         )
         compare = partial(
-            self._compare_rotations, frame.stamp_ns, matches, step.rotation, sensor, keyframe
+            self._compare_rotations, frame.stamp_ns, matches, step.angle, sensor, keyframe
         )
         if not keyframe:
             compare()
@@ -308,11 +308,12 @@ class Pipeline(Processor[PairResult]):
     ) -> None:
         """Compare the rotation by the images over some frames with the rotation by the gyro.
 
-        `by_gyro` (3, 3): since the previous image.
+        `by_gyro` (3,): angle since the previous image [rad]. A gyro in deg/s would turn by more
+        than half a turn in these frames, which a rotation does not show.
         """
         before = self._rotation
         if before is not None:
-            before.by_gyro = before.by_gyro @ by_gyro
+            before.by_gyro = before.by_gyro + by_gyro
             before.frames = before.frames + 1
             # If tracks are lost, pairs are created early, and few tracks live longer.
             if not keyframe and before.frames < _ROTATION_FRAMES:
@@ -334,7 +335,7 @@ class Pipeline(Processor[PairResult]):
                     stamp_ns,
                     seconds_between(before.stamp_ns, stamp_ns),
                     by_images,
-                    log_so3(before.by_gyro),
+                    before.by_gyro,
                 )
         self._rotation = _RotationStart(stamp_ns, ids, rays)
 
@@ -395,7 +396,8 @@ class Pipeline(Processor[PairResult]):
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
         # A pair that may follow a moving object is no evidence, and has no pose.
-        follows_object = data is not None and monitor.second_motions.add(data, fitted)
+        compared = None if monitor.has_other_unit else data
+        follows_object = compared is not None and monitor.second_motions.add(compared, fitted)
         if follows_object:
             data = None
             if monitor.second_motions.has_come:
