@@ -286,7 +286,7 @@ class RollingShutterCamera:
     @property
     def tangential_coefficients(self) -> Array:
         """Coefficients (2,) p1, p2 of the distortion."""
-        return self._compiled.sideways[:2]
+        return self._compiled.sideways[:2].copy()
 
     def _distorted(self, points: ArrayLike) -> Array:
         """Normalised points (N, 2) of raw pixels (N, 2), before the distortion is removed."""

@@ -396,8 +396,9 @@ class Pipeline(Processor[PairResult]):
         known = fitted.rotation_known
         data = _measurement(problem, fitted, since, parameters) if known else None
         # A pair that may follow a moving object is no evidence, and has no pose.
-        compared = None if monitor.has_other_unit else data
-        follows_object = compared is not None and monitor.second_motions.add(compared, fitted)
+        follows_object = False
+        if data is not None and not monitor.has_other_unit:
+            follows_object = monitor.second_motions.add(data, fitted)
         if follows_object:
             data = None
             if monitor.second_motions.has_come:
