@@ -114,17 +114,7 @@ def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Cal
     def bag(name: str, source: str = '') -> Path:
         path = folder / name
         if not path.exists():
-            assert (
-                command_line.main(
-                    [
-                        'convert',
-                        source or name.removesuffix('_b'),
-                        str(recordings / name),
-                        str(path),
-                    ]
-                )
-                == 0
-            )
+            run_command('convert', source or name.removesuffix('_b'), recordings / name, path)
         return path
 
     return bag
@@ -136,6 +126,11 @@ def bundled_bag() -> Path:
     bag = ROOT / 'bags' / 'hand_held'
     assert (bag / 'metadata.yaml').is_file(), f'{bag} is no rosbag2 directory'
     return bag
+
+
+def run_command(*arguments: object) -> None:
+    """Run a command line, which must succeed."""
+    assert command_line.main([str(argument) for argument in arguments]) == 0
 
 
 @pytest.fixture

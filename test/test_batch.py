@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from bag_kinds import copied
-from conftest import rows_of
+from conftest import rows_of, run_command
 import cv2
 import numpy as np
 import pytest
@@ -208,19 +208,8 @@ def client() -> Iterator[Any]:
 def single(tmp_path_factory, bags) -> Path:
     """What a single replay of the first bag writes."""
     out = tmp_path_factory.mktemp('single')
-    assert (
-        main.main(
-            [
-                'replay',
-                str(bags / 'first'),
-                '--params',
-                str(bags / 'first.yaml'),
-                '--out',
-                str(out),
-                '--no-pictures',
-            ]
-        )
-        == 0
+    run_command(
+        'replay', bags / 'first', '--params', bags / 'first.yaml', '--out', out, '--no-pictures'
     )
     return out
 

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 
-from conftest import BUNDLED_PARAMETERS, ROOT, rows_of
+from conftest import BUNDLED_PARAMETERS, ROOT, rows_of, run_command
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -59,7 +59,7 @@ def test_accuracy_command(tmp_path, capsys, monkeypatch):
         '--output',
         str(tmp_path),
     ]
-    assert main(command) == 0
+    run_command(*command)
     report = (tmp_path / 'accuracy.md').read_text()
     assert report in capsys.readouterr().out
     assert report.count('| sideways-outliers-50 |') == 2
@@ -69,7 +69,7 @@ def test_accuracy_command(tmp_path, capsys, monkeypatch):
     }
     assert all(float(row['error_rotation']) < 0.5 for row in rows)
     monkeypatch.setattr(accuracy, 'oracle_estimate', lambda *args: pytest.fail('it runs again'))
-    assert main(command) == 0
+    run_command(*command)
     assert [{**row, 'duration': ''} for row in rows_of(tmp_path / 'trials.csv')] == [
         {**row, 'duration': ''} for row in rows
     ]
@@ -208,23 +208,18 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
     sigmas = np.radians(np.repeat([1.0, 0.1 / np.sqrt(3.0)], 3))
     for pair in true_pairs.read_true_pairs(table):
         np.testing.assert_allclose(pair.covariance, np.diag(sigmas**2))
-    assert (
-        main(
-            [
-                'benchmark',
-                'consistency',
-                '--bags',
-                '0',
-                '--recording',
-                str(bundled_bag),
-                str(BUNDLED_PARAMETERS),
-                str(table),
-                '--compare',
-                '--output',
-                str(tmp_path),
-            ]
-        )
-        == 0
+    run_command(
+        'benchmark',
+        'consistency',
+        '--bags',
+        '0',
+        '--recording',
+        bundled_bag,
+        BUNDLED_PARAMETERS,
+        table,
+        '--compare',
+        '--output',
+        tmp_path,
     )
     report = (tmp_path / 'consistency.md').read_text()
     for method in ('recordings', 'readout ignored', 'MAGSAC'):
@@ -252,19 +247,14 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
 def test_suggested_values_of_wrong_parameters(bundled_bag, tmp_path, monkeypatch):
     """Its file is right: a focal length that the CameraInfo does not have is named."""
     monkeypatch.setattr(suggestions, 'ROWS', {'focal x1.05': suggestions.ROWS['focal x1.05']})
-    assert (
-        main(
-            [
-                'benchmark',
-                'suggestions',
-                '--recording',
-                str(bundled_bag),
-                str(BUNDLED_PARAMETERS),
-                '--output',
-                str(tmp_path),
-            ]
-        )
-        == 0
+    run_command(
+        'benchmark',
+        'suggestions',
+        '--recording',
+        bundled_bag,
+        BUNDLED_PARAMETERS,
+        '--output',
+        tmp_path,
     )
     right, wrong = rows_of(tmp_path / 'suggestions.csv')
     assert right['others'] == '' and right['estimated'] == ''
@@ -325,7 +315,7 @@ def test_a_true_path_is_that_of_the_pairs_of_the_policy(bundled_bag, tmp_path):
     assert known.pair(stamps[0], stamps[5]) is None
     (tmp_path / 'pseudo_truth.csv').write_text('never read')
     arguments = ['--scored', str(bundled_bag), str(tmp_path), '--lens-known']
-    assert main(['benchmark', 'carried-over', *arguments, '--output', str(tmp_path)]) == 0
+    run_command('benchmark', 'carried-over', *arguments, '--output', tmp_path)
     rows = rows_of(tmp_path / 'consistency.csv')
     assert len(rows) >= 4
     assert {row['source'] for row in rows} == {'calibrated on its first half'}
@@ -543,25 +533,20 @@ def test_a_missing_lens_is_named_although_a_little_more_of_it_would_not_move_the
 
 
 def test_command_distinguishes_wrong_from_right(tmp_path):
-    assert (
-        main(
-            [
-                'benchmark',
-                'trust',
-                '--bags',
-                '1',
-                '--rows',
-                RIGHT,
-                'imu-cycled',
-                '--seconds',
-                '6',
-                '--seed',
-                '3',
-                '--output',
-                str(tmp_path),
-            ]
-        )
-        == 0
+    run_command(
+        'benchmark',
+        'trust',
+        '--bags',
+        '1',
+        '--rows',
+        RIGHT,
+        'imu-cycled',
+        '--seconds',
+        '6',
+        '--seed',
+        '3',
+        '--output',
+        tmp_path,
     )
     with (tmp_path / 'trust_bags.csv').open(newline='') as file:
         right, cycled = csv.DictReader(file)

@@ -6,6 +6,7 @@ import re
 from types import SimpleNamespace
 
 from bag_kinds import copied, STAMP_NS, write_kind
+from conftest import run_command
 import cv2
 import message_builders as build
 import numpy as np
@@ -732,7 +733,7 @@ def test_command_line(tmp_path, capsys):
     good = Small().write(tmp_path / 'good')
     bad = broken(info=uncalibrated).write(tmp_path / 'bad')
     options = ['--set', 'readout_time=0.02', '--set', 'quat_cam_imu_xyzw=[0, 0, 0, 1]']
-    assert main(['check', str(good), *options]) == 0
+    run_command('check', good, *options)
     shown = capsys.readouterr()
     assert shown.err == ''
     assert not re.search('^(warning|failure)', shown.out, re.MULTILINE)

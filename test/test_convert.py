@@ -9,7 +9,7 @@ import re
 import sys
 from typing import Any
 
-from conftest import ROOT
+from conftest import ROOT, run_command
 import cv2
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ class Converted:
 
 
 def converted(source: str, path: Path, bag: Path, *options: str) -> Converted:
-    assert main.main(['convert', source, str(path), str(bag), *options]) == 0
+    run_command('convert', source, path, bag, *options)
     messages: dict[str, list[BagMessage]] = {}
     with open_bag(bag) as opened:
         found = opened.find_topics(needs_camera_info=False)

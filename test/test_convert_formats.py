@@ -3,6 +3,7 @@
 import csv
 import json
 
+from conftest import run_command
 import logged_walks as made
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from test_convert import refused as not_converted
 from rs_relpose_lab.simulation.config import SimulationConfig
 from rs_relpose_lab.simulation.simulation import simulate
 from rs_relpose_ros.bags.convert import FORMATS
-from rs_relpose_ros.cli import main, recordings
+from rs_relpose_ros.cli import recordings
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 
@@ -50,7 +51,7 @@ def poses_are_right(walk, folder, bag, *settings):
     arguments = ['replay', str(bag), '--params', f'{bag}.yaml', '--no-pictures', '--out', str(out)]
     for setting in settings:
         arguments += ['--set', setting]
-    assert main.main(arguments) == 0
+    run_command(*arguments)
     with (out / 'relative_poses.csv').open() as file:
         rows = [row for row in csv.DictReader(file) if row['tx'] not in ('', 'nan')]
     assert len(rows) >= 2
@@ -274,7 +275,7 @@ def test_calibration_of_another_tool(name, tmp_path, caplog, capsys):
     path.write_text('\ufeff' + text if name == 'kalibr' else text)
     given = read_parameters(path)
     assert 'is a calibration file' in caplog.text and 'quat_cam_imu_xyzw' in caplog.text
-    assert main.main(['convert', 'calibration', str(path), '--out', str(out)]) == 0
+    run_command('convert', 'calibration', path, '--out', out)
     assert 'readout time is not in this file' in capsys.readouterr().out
     for parameters in (given, read_parameters(out)):
         np.testing.assert_allclose(parameters.sensor.R_cam_imu, T_CAM_IMU[:3, :3], atol=1e-8)
@@ -302,7 +303,7 @@ def test_calibration_of_ros(tmp_path, capsys):
         'distortion_model: equidistant\n'
         'distortion_coefficients: {rows: 1, cols: 4, data: [0.1, 0.02, 0.003, 0.0004]}\n'
     )
-    assert main.main(['convert', 'calibration', str(tmp_path / 'ost.yaml')]) == 0
+    run_command('convert', 'calibration', tmp_path / 'ost.yaml')
     (tmp_path / 'mine.yaml').write_text(capsys.readouterr().out)
     intrinsics = read_parameters(tmp_path / 'mine.yaml').intrinsics
     assert intrinsics.camera_matrix == (401.5, 0, 331, 0, 399.25, 236.5, 0, 0, 1)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
-from conftest import rows_of
+from conftest import rows_of, run_command
 import cv2
 import numpy as np
 import pytest
@@ -21,14 +21,13 @@ from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, VIEW
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.simulation import rows
 from rs_relpose_lab.simulation.rows import observe, uniform_motion
-from rs_relpose_ros.cli import main
 from rs_relpose_ros.estimator.result import Status
 
 
 def evaluate(folder, experiment, *arguments):
     """Rows of the trials and of the cells."""
     words = ['evaluate', experiment, *arguments, '--output', folder]
-    assert main.main([str(word) for word in words]) == 0
+    run_command(*[str(word) for word in words])
     return [rows_of(folder / name) for name in ('trials.csv', 'cells.csv')]
 
 

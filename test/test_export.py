@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from bag_kinds import copied
-from conftest import BUNDLED_PARAMETERS
+from conftest import BUNDLED_PARAMETERS, run_command
 import cv2
 import numpy as np
 import pytest
@@ -39,10 +39,7 @@ LAST_NS = round(READOUT_NS * 479 / 480)
 @pytest.fixture(scope='module')
 def trajectory(bundled_bag, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp('odometry') / 'results'
-    assert (
-        command_line(['odometry', str(bundled_bag), *PARAMS, '--rate', '50', '--out', str(folder)])
-        == 0
-    )
+    run_command('odometry', bundled_bag, *PARAMS, '--rate', '50', '--out', folder)
     return folder
 
 
@@ -134,22 +131,17 @@ def test_a_tum_file_at_any_rate(bundled_bag, rows, trajectory, tmp_path):
     np.testing.assert_allclose(lines[:, 1:4], p, atol=1e-8)
     np.testing.assert_allclose(Rotation.from_quat(lines[:, 4:]).as_matrix(), R, atol=1e-8)
     out = tmp_path / 'path.tum'
-    assert (
-        command_line(
-            [
-                'export',
-                str(bundled_bag),
-                str(out),
-                '--format',
-                'tum',
-                '--trajectory',
-                str(trajectory),
-                *PARAMS,
-                '--rate',
-                '50',
-            ]
-        )
-        == 0
+    run_command(
+        'export',
+        bundled_bag,
+        out,
+        '--format',
+        'tum',
+        '--trajectory',
+        trajectory,
+        *PARAMS,
+        '--rate',
+        '50',
     )
     assert out.read_bytes() == (trajectory / 'trajectory_rows.tum').read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ['path.tum']
@@ -209,7 +201,7 @@ def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
     code, out = run('--format', 'colmap')
     assert code == 0
     bag = tmp_path / 'unrolled'
-    assert command_line(['unroll', str(bundled_bag), str(bag), *PARAMS]) == 0
+    run_command('unroll', bundled_bag, bag, *PARAMS)
     with open_bag(bag) as opened:
         unrolled = [
             bytes(one.message.data)
@@ -254,21 +246,7 @@ def test_raw_images_are_kept_once_and_linked(run, trajectory, tmp_path):
 
 def test_the_odometry_is_run_if_it_is_not_given(bundled_bag, rows, tmp_path):
     out = tmp_path / 'model'
-    assert (
-        command_line(
-            [
-                'export',
-                str(bundled_bag),
-                str(out),
-                *PARAMS,
-                '--format',
-                'gsplat',
-                '--images',
-                'none',
-            ]
-        )
-        == 0
-    )
+    run_command('export', bundled_bag, out, *PARAMS, '--format', 'gsplat', '--images', 'none')
     np.testing.assert_array_equal(
         RowTrajectory.load(out / 'odometry' / 'trajectory_rows.npz').positions, rows.positions
     )

@@ -4,7 +4,7 @@ from dataclasses import replace
 import json
 import math
 
-from conftest import BUNDLED_PARAMETERS
+from conftest import BUNDLED_PARAMETERS, run_command
 import gtsam
 import numpy as np
 import pytest
@@ -160,19 +160,8 @@ def test_depth_of_the_scene_is_that_of_parallaxes():
 
 def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(loops, '_APART', 2.0)  # the bag has 6 s
-    assert (
-        main(
-            [
-                'odometry',
-                str(bundled_bag),
-                '--params',
-                str(BUNDLED_PARAMETERS),
-                '--out',
-                str(tmp_path),
-                '--loops',
-            ]
-        )
-        == 0
+    run_command(
+        'odometry', bundled_bag, '--params', BUNDLED_PARAMETERS, '--out', tmp_path, '--loops'
     )
     printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'summary.json').read_text())

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from conftest import BUNDLED_PARAMETERS, rows_of
+from conftest import BUNDLED_PARAMETERS, rows_of, run_command
 import cv2
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def numbers(row: dict[str, str], names: str) -> np.ndarray:
 def replayed(bundled_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outputs of a replay of the bundled bag with everything on."""
     folder = tmp_path_factory.mktemp('replay')
-    assert main(['replay', str(bundled_bag), *PARAMETERS, '--out', str(folder), '--bag']) == 0
+    run_command('replay', bundled_bag, *PARAMETERS, '--out', folder, '--bag')
     return folder
 
 
@@ -339,24 +339,19 @@ def test_recordings(converted, tmp_path, name):
     """
     bag = converted(name)
     out = tmp_path / 'out'
-    assert (
-        main(
-            [
-                'replay',
-                str(bag),
-                '--params',
-                f'{bag}.yaml',
-                '--set',
-                'use_gyro_rotation=false',
-                '--set',
-                'max_translation_sigma=30',
-                '--set',
-                'exposure_margin=0.0',
-                '--out',
-                str(out),
-            ]
-        )
-        == 0
+    run_command(
+        'replay',
+        bag,
+        '--params',
+        f'{bag}.yaml',
+        '--set',
+        'use_gyro_rotation=false',
+        '--set',
+        'max_translation_sigma=30',
+        '--set',
+        'exposure_margin=0.0',
+        '--out',
+        out,
     )
     summary = summary_of(out)
     assert summary['frames']['processed'] == summary['frames']['in_bag']

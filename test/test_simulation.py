@@ -6,6 +6,7 @@ from pathlib import Path
 import re
 import shlex
 
+from conftest import run_command
 import cv2
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from rs_relpose_lab.simulation.bag import write_parameters
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.scene import Scene, Surface
-from rs_relpose_ros.cli import main as cli
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 
@@ -309,20 +309,15 @@ def stamp_ns(message):
 
 @pytest.mark.parametrize(('raw', 'topic'), [([], IMAGES), (['--raw'], '/camera/image_raw')])
 def test_command_writes_a_bag_and_its_parameters(raw, topic, tmp_path, capsys):
-    assert (
-        cli.main(
-            [
-                'simulate',
-                str(tmp_path / 'bag'),
-                *SMALL,
-                '--time-offset',
-                '0.004',
-                '--exposure-time',
-                '0.01',
-                *raw,
-            ]
-        )
-        == 0
+    run_command(
+        'simulate',
+        tmp_path / 'bag',
+        *SMALL,
+        '--time-offset',
+        '0.004',
+        '--exposure-time',
+        '0.01',
+        *raw,
     )
     captured = capsys.readouterr()
     assert '6 images' in captured.out
