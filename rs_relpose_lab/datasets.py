@@ -34,6 +34,7 @@ def _readout_time(parameters: Iterable[SourcedValue]) -> float:
     return float(str(next(item.value for item in parameters if item.name == 'readout_time')))
 
 
+# Names of the images of the data set, with their numbers.
 _XIAOMI_IMAGE = re.compile(r'RE_frame-([0-9]{1,6})\.jpg')
 
 

@@ -102,63 +102,64 @@ def simulated_flight(
     world = rng.uniform([-4.0, -2.0, 6.0], [4.0, 2.0, 20.0], (points, 3))
     frames = [Keyframe(world, time, rng) for time in places]
     chosen = [np.arange(points)] * (len(TIMES) - 1) if tracks is None else list(tracks)
-    first = frames[0]
     pairs = []
-    baselines = []
     true_landmarks = []
     for k, (a, b, use) in enumerate(zip(frames[:-1], frames[1:], chosen, strict=True)):
-        t = a.rotation.inv().apply(b.position - a.position)
-        length = float(np.linalg.norm(t))
-        baselines.append(length)
         # Shuffled: only the ids identify the tracks.
-        use = rng.permutation(use)
-        pose = RelativePose(
-            status=Status.OK,
-            R=(a.rotation.inv() * b.rotation).as_matrix(),
-            angular_velocity2=b.rate,
-            inliers=np.ones(len(use), dtype=bool),
-            covariance=1e-6 * np.eye(6),
-            velocity_covariance=1e-4 * np.eye(6),
-            diagnostics=Diagnostics(model='uniform'),
+        shuffled = rng.permutation(use)
+        pairs.append(_exact_pair(TIMES[k], TIMES[k + 1], a, b, shuffled))
+        seen_1 = a.points[shuffled]
+        seen_2 = b.points[shuffled]
+        true_landmarks.append(Landmarks(VIEW.project(seen_1), VIEW.project(seen_2), seen_1))
+    places_m = np.array([frame.position for frame in frames])
+    baselines = np.linalg.norm(np.diff(places_m, axis=0), axis=1)
+    to_first = frames[0].rotation.inv()
+    positions = to_first.apply(places_m - places_m[0])
+    rotations = [(to_first * frame.rotation).as_matrix() for frame in frames]
+    return Flight(pairs, positions, rotations, baselines, true_landmarks)
+
+
+def _exact_pair(
+    begin: float, end: float, a: Keyframe, b: Keyframe, use: NDArray[np.int64]
+) -> PairResult:
+    """The pair of two keyframes at times [s], whose pose and matches have no error."""
+    t = a.rotation.inv().apply(b.position - a.position)
+    length = float(np.linalg.norm(t))
+    pose = RelativePose(
+        status=Status.OK,
+        R=(a.rotation.inv() * b.rotation).as_matrix(),
+        angular_velocity2=b.rate,
+        inliers=np.ones(len(use), dtype=bool),
+        covariance=1e-6 * np.eye(6),
+        velocity_covariance=1e-4 * np.eye(6),
+        diagnostics=Diagnostics(model='uniform'),
+    )
+    if length > 0.0:
+        pose = replace(
+            pose,
+            t=t / length,
+            linear_velocity1=a.velocity / length,
+            linear_velocity2=b.velocity / length,
         )
-        if length > 0.0:
-            pose = replace(
-                pose,
-                t=t / length,
-                linear_velocity1=a.velocity / length,
-                linear_velocity2=b.velocity / length,
-            )
-        else:
-            pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
-        matches = Matches(
-            use.astype(np.uint32) + 7,
-            np.stack([a.pixels[use], b.pixels[use]]),
-            np.ones(len(use)),
-            np.stack([a.rays[use], b.rays[use]]),
-            np.stack([a.tau[use], b.tau[use]]),
-        )
-        true_landmarks.append(
-            Landmarks(VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use])
-        )
-        points = cache(partial(landmarks, pose, matches.rays, matches.row_times, SENSOR.camera))
-        stamps = [START_NS + round(1e9 * time) for time in TIMES[k : k + 2]]
-        pairs.append(
-            PairResult(
-                *stamps,
-                *stamps,
-                'camera',
-                TIMES[k + 1] - TIMES[k],
-                pose,
-                matches,
-                10.0,
-                points if pose else None,
-            )
-        )
-    positions = np.array([first.rotation.inv().apply(f.position - first.position) for f in frames])
-    return Flight(
-        pairs,
-        positions,
-        [(first.rotation.inv() * f.rotation).as_matrix() for f in frames],
-        np.array(baselines),
-        true_landmarks,
+    else:
+        pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
+    matches = Matches(
+        use.astype(np.uint32) + 7,
+        np.stack([a.pixels[use], b.pixels[use]]),
+        np.ones(len(use)),
+        np.stack([a.rays[use], b.rays[use]]),
+        np.stack([a.tau[use], b.tau[use]]),
+    )
+    points = cache(partial(landmarks, pose, matches.rays, matches.row_times, SENSOR.camera))
+    stamps = [START_NS + round(1e9 * time) for time in (begin, end)]
+    parallax = 10.0
+    return PairResult(
+        *stamps,
+        *stamps,
+        'camera',
+        end - begin,
+        pose,
+        matches,
+        parallax,
+        points if pose else None,
     )

@@ -114,34 +114,14 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
     ]
     times = np.arange(0.0, seconds, INTERVAL)
     middle = path.states(times + ROW)
-    noise = np.diag([SIGMA_R**2] * 3 + [SIGMA_T**2] * 2)
     pairs = []
     for k in range(len(times) - 1):
         R1, R2 = middle.R_world_cam[k : k + 2]
         way = R1.T @ (middle.position[k + 1] - middle.position[k])
-        error = rng.multivariate_normal(np.zeros(5), noise)
-        R = exp_so3(-error[:3]) @ R1.T @ R2
-        baseline = float(np.linalg.norm(way))
-        status = 'OK'
-        if baseline > 0.01:
-            t = way / baseline
-            t = t - tangent_basis(t) @ error[3:]
-            information = np.zeros((11, 11))
-            information[:5, :5] = np.linalg.inv(noise)
-            images = ImageInformation(
-                ROW, R, t / np.linalg.norm(t), np.tile(t / INTERVAL, 2), information, np.zeros(11)
-            )
-        else:
-            status = 'PURE_ROTATION'
-            baseline = math.nan
-            images = ImageInformation(
-                ROW,
-                R,
-                np.full(3, np.nan),
-                np.full(6, np.nan),
-                np.linalg.inv(noise[:3, :3]),
-                np.zeros(3),
-            )
+        images = estimate_of_images(R1.T @ R2, way, rng)
+        moves = bool(np.isfinite(images.t).all())
+        status = 'OK' if moves else 'PURE_ROTATION'
+        baseline = float(np.linalg.norm(way)) if moves else math.nan
         stamp1, stamp2 = (START_NS + round(times[i] * 1e9) for i in (k, k + 1))
         pairs.append(
             PublishedPair(
@@ -163,6 +143,27 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
     return Walk(
         pairs, samples, stamps, states.position, Rotation.from_matrix(states.R_world_cam).as_quat()
     )
+
+
+def estimate_of_images(
+    R_true: np.ndarray, way: np.ndarray, rng: np.random.Generator
+) -> ImageInformation:
+    """An estimate of a pair with drawn errors; of the rotation alone if the camera stays."""
+    noise = np.diag([SIGMA_R**2] * 3 + [SIGMA_T**2] * 2)
+    error = rng.multivariate_normal(np.zeros(5), noise)
+    R = exp_so3(-error[:3]) @ R_true
+    baseline = float(np.linalg.norm(way))
+    if baseline > 0.01:
+        direction = way / baseline
+        t = direction - tangent_basis(direction) @ error[3:]
+        information = np.zeros((11, 11))
+        information[:5, :5] = np.linalg.inv(noise)
+        velocities = np.tile(t / INTERVAL, 2)
+        unit = t / np.linalg.norm(t)
+        return ImageInformation(ROW, R, unit, velocities, information, np.zeros(11))
+    of_rotation = np.linalg.inv(noise[:3, :3])
+    unknown = np.full(3, np.nan)
+    return ImageInformation(ROW, R, unknown, np.full(6, np.nan), of_rotation, np.zeros(3))
 
 
 @pytest.fixture(scope='module')

@@ -571,21 +571,40 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         if 'odometry_node' in message.status[0].name
     ]
     assert 'tracking' in [value['state'] for value in values]
+    keyframes, truth = replayed(bundled_bag, pairs)
+    of_keyframes = assert_those_of_the_replay(received, keyframes)
+    # By the IMU, at increasing times; the camera's clock is that of the IMU here.
+    assert (np.diff([stamp_of(message) for message in propagated]) > 0).all()
+    # Twelve frames in all to a keyframe, less what a busy machine loses.
+    assert len(propagated) > 2 * len(of_keyframes)
+    for messages in (of_keyframes, propagated):
+        assert_metric(messages, truth, 0.08, 0.03, BASE)
+        # z is up in both: gravity is found. The path of 6 m itself is aligned to 2 deg only.
+        assert largest_tilt(messages, truth, BASE) < 2.0
+    assert_sent_as_transforms(propagated, transforms)
+    assert_fused_by_the_shipped_filter(propagated)
 
-    # The same pairs and samples, given to the estimator in another order.
+
+def replayed(bag_path, pairs):
+    """Keyframes by their stamps, and the truth: all samples come before the pairs."""
     parameters = read_parameters(BUNDLED_PARAMETERS).updated(
         {'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA}
     )
     estimator = OdometryEstimator(parameters)
-    with open_bag(bundled_bag) as bag:
+    with open_bag(bag_path) as bag:
         topics = bag.find_topics()
         truth = read_truth(bag, topics)
         for message in bag.messages([topics.imu]):
             estimator.add_imu(PARTS[Role.IMU].read(message.message))
     keyframes = {}
-    for message in sorted(pairs, key=lambda message: stamp_of(message)):
+    for message in sorted(pairs, key=stamp_of):
         estimator.add_pair(PublishedPair.of_status(message))
         keyframes |= {keyframe.stamp_ns: keyframe for keyframe in estimator.take()}
+    return keyframes, truth
+
+
+def assert_those_of_the_replay(received, keyframes):
+    """At least ten messages are of keyframes of the replay, with their poses; these messages."""
 
     def nearest(message):
         """Stamp of the keyframe next to a message: the order changes the learned offset."""
@@ -606,15 +625,11 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         assert np.degrees(turn.magnitude()) < 0.04
         assert message.header.frame_id == 'odom'
         assert message.child_frame_id == 'base_link'
+    return of_keyframes
 
-    # By the IMU, at increasing times; the camera's clock is that of the IMU here.
-    assert (np.diff([stamp_of(message) for message in propagated]) > 0).all()
-    # Twelve frames in all to a keyframe, less what a busy machine loses.
-    assert len(propagated) > 2 * len(of_keyframes)
-    for messages in (of_keyframes, propagated):
-        assert_metric(messages, truth, 0.08, 0.03, BASE)
-        # z is up in both: gravity is found. The path of 6 m itself is aligned to 2 deg only.
-        assert largest_tilt(messages, truth, BASE) < 2.0
+
+def assert_sent_as_transforms(propagated, transforms):
+    """Nearly all poses are sent as transforms, too."""
     by_stamp = {stamp_of(message): message.pose.pose for message in propagated}
     assert len(transforms) > 0.9 * len(propagated)
     for sent in transforms:
@@ -624,14 +639,19 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
                 vector_of(sent.transform.translation), vector_of(pose.position)
             )
 
-    # A filter with the shipped configuration; pose and twist agree, and the twist alone leads
-    # along the poses. Found on a replay: 2.7, and 2400 with the twist in the axes of the camera;
-    # live on a busy machine, where corrections are late and larger, 5.1. A twist without the lever
-    # arm (7.2) shows in its path: 0.22 m.
+
+def assert_fused_by_the_shipped_filter(propagated):
+    """Pose and twist agree in a filter, and the twist alone leads along the poses.
+
+    Found on a replay: 2.7, and 2400 with the twist in the axes of the camera; live on a busy
+    machine, where corrections are late and larger, 5.1. A twist without the lever arm (7.2) shows
+    in its path: 0.22 m.
+    """
     text = (ROOT / 'config' / 'robot_localization.yaml').read_text()
     ekf = yaml.safe_load(text)['ekf_filter_node']['ros__parameters']
     assert ekf['odom0'] == '/odometry_node/odometry'
-    assert ekf['publish_tf'] and not parameters.odometry.publish_odometry_tf
+    assert ekf['publish_tf']
+    assert not read_parameters(BUNDLED_PARAMETERS).odometry.publish_odometry_tf
     assert (ekf['odom_frame'], ekf['base_link_frame']) == ('odom', 'base_link')
     # A busy machine leaves gaps, in which no twist is constant.
     gaps = np.flatnonzero(np.diff([stamp_of(message) for message in propagated]) > SECOND // 10)

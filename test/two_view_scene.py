@@ -85,10 +85,8 @@ def make_scene(
     `reference` the row that pose and motion refer to.
     """
     rng = np.random.default_rng(seed)
-    view = replace(
-        VIEW,
-        reference_row={'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference],
-    )
+    reference_rows = {'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}
+    view = replace(VIEW, reference_row=reference_rows[reference])
     p2 = BASELINES[direction] + rng.normal(size=3) * 0.2
     if pure_rotation:
         p2 = np.zeros(3)
@@ -109,13 +107,9 @@ def make_scene(
             return ends[0] + rng.uniform(size=(8 * n, 1)) * (ends[1] - ends[0])
         return rng.uniform([-30, -18, 6], [30, 18, 34], (8 * n, 3))
 
-    exact = in_both_views(
-        candidates,
-        uniform_motion(R1, np.zeros(3), w1, v1),
-        uniform_motion(R2, p2, w2, v2),
-        view,
-        n,
-    )
+    motion1 = uniform_motion(R1, np.zeros(3), w1, v1)
+    motion2 = uniform_motion(R2, p2, w2, v2)
+    exact = in_both_views(candidates, motion1, motion2, view, n)
     points1, points2, is_outlier = measured(exact, view, pixel_noise, outliers, rng)
     length = np.linalg.norm(p2) if not pure_rotation else 1.0
     tilt = Rotation.from_rotvec(gravity_noise * rng.choice([-1.0, 1.0], 3))
@@ -164,31 +158,8 @@ def make_minimal_problems(
         velocity = np.linalg.norm(v1, axis=1, keepdims=True) * p2 / length
         v1 = R1.inv().apply(velocity)
         v2 = R2.inv().apply(velocity)
-    rays1, rays2 = np.empty((2, count * n, 3))
-    tau1, tau2 = np.empty((2, count * n))
-    missing = np.arange(count * n)
     owner = np.repeat(np.arange(count), n)
-    while len(missing):
-        k = owner[missing]
-        pixels = rng.uniform([0, 0], SIZE, (len(k), 2))
-        a = VIEW.unproject(pixels)
-        tau = pixels[:, 1] * LINE_DELAY
-        turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
-        world = turn.apply(rng.uniform(6, 34, (len(k), 1)) * a) + (
-            tau[:, None] * R1[k].apply(v1[k])
-        )
-        second = uniform_motion(R2[k], p2[k], w2[k], v2[k])
-        rows = np.full(len(k), HEIGHT / 2)
-        for _ in range(15):
-            later = rows * LINE_DELAY
-            b = second(world, later)
-            pixels = VIEW.project(b)
-            rows = pixels[:, 1]
-        observed = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= SIZE)).all(axis=1)
-        found = missing[observed]
-        rays1[found], tau1[found] = a[observed], tau[observed]
-        rays2[found], tau2[found] = b[observed], later[observed]
-        missing = missing[~observed]
+    rays1, tau1, rays2, tau2 = _exact_rays(rng, owner, (R1, w1, v1), (R2, p2, w2, v2))
     Q1, Q2 = (
         Rotation.random(count, random_state=rng) if turned else Rotation.identity(count)
         for _ in range(2)
@@ -214,6 +185,43 @@ def make_minimal_problems(
         Q1.apply(w1),
         Q2.apply(w2),
     )
+
+
+def _exact_rays(rng, owner, first, second):
+    """Rays (N, 3) and row times (N,) of points in both views of the problems `owner` (N,).
+
+    `first` has the rotations, rates and velocities of the first cameras, `second` has rotations,
+    positions, rates and velocities of the second ones.
+    """
+    R1, w1, v1 = first
+    R2, p2, w2, v2 = second
+    rays1, rays2 = np.empty((2, len(owner), 3))
+    tau1, tau2 = np.empty((2, len(owner)))
+    missing = np.arange(len(owner))
+    while len(missing):
+        k = owner[missing]
+        pixels = rng.uniform([0, 0], SIZE, (len(k), 2))
+        a = VIEW.unproject(pixels)
+        tau = pixels[:, 1] * LINE_DELAY
+        turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
+        depths = rng.uniform(6, 34, (len(k), 1))
+        world = turn.apply(depths * a) + tau[:, None] * R1[k].apply(v1[k])
+        motion = uniform_motion(R2[k], p2[k], w2[k], v2[k])
+        rows = np.full(len(k), HEIGHT / 2)
+        for _ in range(15):
+            later = rows * LINE_DELAY
+            b = motion(world, later)
+            pixels = VIEW.project(b)
+            rows = pixels[:, 1]
+        inside = ((pixels >= 0) & (pixels <= SIZE)).all(axis=1)
+        observed = inside & (b[:, 2] > 1.0)
+        found = missing[observed]
+        rays1[found] = a[observed]
+        tau1[found] = tau[observed]
+        rays2[found] = b[observed]
+        tau2[found] = later[observed]
+        missing = missing[~observed]
+    return rays1, tau1, rays2, tau2
 
 
 def rotation_error(R, truth):

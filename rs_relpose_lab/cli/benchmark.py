@@ -14,6 +14,7 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.settings import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
+# Summary for the list of commands.
 HELP = (
     'Measure the package: the estimator on simulated frame pairs, the live node, the '
     'calibration. Writes tables (CSV, Markdown) into a folder.'
@@ -38,6 +39,7 @@ class Benchmark(NamedTuple):
     run: _Run
 
 
+# Benchmarks by name; `_benchmark` adds them.
 BENCHMARKS: dict[str, Benchmark] = {}
 
 
@@ -164,6 +166,7 @@ def _flag(option: str, text: str) -> Argument:
     return Argument(option, {'action': 'store_true', 'help': text})
 
 
+# Number of processes, for benchmarks whose work can be divided.
 _JOBS = _number('--jobs', 1, 'processes', low=1)
 
 

@@ -19,8 +19,10 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
 
+# Summary for the list of commands.
 HELP = 'Repeat an experiment of the paper: tables (printed and CSV), box plots (PNG).'
 
+# Description of `evaluate paper`.
 _PAPER_HELP = (
     'The synthetic experiments of the paper: two 1920x1080 rolling-shutter images (60 us per row) '
     'of 300 points, projected exactly row by row, 2 m apart in forward or sideways motion, '
@@ -29,6 +31,7 @@ _PAPER_HELP = (
     'with any number of jobs.'
 )
 
+# Description of `evaluate penncosyvio`.
 _PENNCOSYVIO_HELP = (
     "The paper's experiment on the trajectories of PennCOSYVIO: of eight stretches of the "
     "sequences 'as' and 'af', every fifth frame and the one 30 frames later, IMU averaged over "

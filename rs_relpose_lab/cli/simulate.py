@@ -11,6 +11,7 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.settings import Declared, declared
 from rs_relpose_ros.output_files import refuse_existing
 
+# Summary for the list of commands.
 HELP = (
     'Render true rolling-shutter images (every row at its own time) of a textured scene '
     'along a hand-held-like walk, with IMU and ground truth, into a rosbag2 directory (MCAP) '

@@ -14,6 +14,7 @@ from rs_relpose_lab.simulation.trajectory import FinePath, Trajectory
 from rs_relpose_ros.calibration.observations import axis_maps, GyroSeries, TrackedPoints
 from rs_relpose_ros.geometry import Array
 
+# Time of the first image [ns]. [chosen: a usual time since 1970]
 START_NS = 1_700_000_000_000_000_000
 
 

@@ -33,9 +33,11 @@ from rs_relpose_ros.offline.replay import read_truth as truth_of_bag
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 
+# Degrees of freedom of a rotation. [derived: three angles]
 R_FREEDOM = 3
+# Degrees of freedom of a direction. [derived: two angles]
 T_FREEDOM = 2
-# Of the errors of poses within their covariance.
+# Share of right errors within the ellipsoid that is counted. [derived: three sigmas]
 QUANTILE = 0.997
 # Of keyframes [px]: the default's, and one that makes pairs of about twice the interval.
 PARALLAXES = (12.0, 30.0)
@@ -43,13 +45,17 @@ PARALLAXES = (12.0, 30.0)
 STILL = 0.03
 # Longest interval of a short pair [s].
 SHORT = 0.25
+# Name of the rows of simulated bags. [derived: the report]
 SIMULATED = 'simulated'
+# Name of the rows of recordings. [derived: the report]
 RECORDED = 'recordings'
-# In comparison on recordings: the same parameters but for these, and OpenCV's 5-point on the same
-# matches with this threshold [px].
+# Name of the comparison with the readout ignored. [derived: the report]
 NO_READOUT = 'readout ignored'
+# Name of the comparison with OpenCV's 5-point solver on the same matches. [derived: the report]
 MAGSAC = 'MAGSAC'
+# What differs in the parameters of the comparison with the readout ignored.
 IGNORE_READOUT = {'readout_time': 0.0, 'withhold_when_wrong': False}
+# Threshold of OpenCV on these matches [px]. [chosen: its default]
 THRESHOLD = 1.0
 # Covariance of the truth of a simulation.
 _EXACT = np.zeros((6, 6))

@@ -31,7 +31,9 @@ if TYPE_CHECKING:  # the rest of this module needs no ROS
     from rs_relpose_lab.live.live_run import MeasuredRun, ReceivedPose
 
 
+# Sizes of the images of the live node [px]. [chosen: VGA, HD and full HD]
 SIZES = ((640, 480), (1280, 720), (1920, 1080))
+# Formats of these images: encodings of sensor_msgs/Image, and compressed ones.
 FORMATS = ('mono8', 'bgr8', 'jpeg')
 
 
@@ -57,6 +59,7 @@ class LiveCell:
         return self.width * self.height * bytes_per_pixel > 512 * 1024
 
 
+# Cells by name: each size, format and rate of the IMU that is measured.
 CELLS = {
     cell.name: cell
     for cell in (
@@ -451,6 +454,7 @@ def memory_drift(course: Course) -> float:
 
 # -- two checkouts by turns: times of one run compare, those of two hours do not ------------------
 
+# Number of turns of two checkouts. [chosen: the median of three leaves one bad turn out]
 TURNS = 3
 # Columns of live.csv, the same in all releases.
 COMPARED = (

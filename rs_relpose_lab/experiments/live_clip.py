@@ -28,7 +28,9 @@ from rs_relpose_ros.messages.outgoing import encoded_image_message
 
 # Duration of the motion before it repeats itself [s].
 PERIOD = 4.0
+# Images per second of a clip. [chosen: usual cameras]
 FPS = 30.0
+# Samples of the IMU per second. [chosen: usual IMUs]
 IMU_RATES = (200, 400)
 
 

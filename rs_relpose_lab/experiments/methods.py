@@ -257,6 +257,7 @@ def undistorted(points: Array, camera: RollingShutterCamera) -> Array:
     )
 
 
+# OpenCV's robust estimators by the names of their methods.
 OPENCV_ESTIMATORS = {'RANSAC': cv2.RANSAC, 'USAC_MAGSAC': cv2.USAC_MAGSAC}
 
 

@@ -43,10 +43,10 @@ from rs_relpose_ros.offline.truth import TrueTrajectory
 # recording of the EuRoC MAV dataset, its IMU, and the camera's poses by PnP of each image's
 # corners. Its README names the origin.
 
+# Name of the recording in the report.
 NAME = 'EuRoC imu_april'
 
-# Calibration of the dataset (cam0 of the VI-Sensor); the bias is fitted (README of the folder)
-# with a lens whose principal point fits these corners, 7 px off the given one.
+# Camera of the dataset: cam0 of the VI-Sensor. [derived: its sensor.yaml]
 _CAMERA = RollingShutterCamera(
     width=752,
     height=480,
@@ -57,6 +57,7 @@ _CAMERA = RollingShutterCamera(
     distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
     readout_time=0.0,
 )
+# Pose (3, 4) of the camera in the body, which is the IMU. [derived: T_BS in the same file]
 _BODY_FROM_CAMERA = np.array(
     [
         [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
@@ -64,7 +65,10 @@ _BODY_FROM_CAMERA = np.array(
         [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949],
     ]
 )
+# Bias of the gyro [rad/s]. [measured: a fit (README of the folder) with a lens whose principal
+# point fits these corners, 7 px off the given one]
 _GYRO_BIAS = (-0.0016, 0.0250, 0.0777)
+# Corners of the AprilGrid. [derived: 36 tags]
 _CORNERS = 144
 
 
@@ -146,8 +150,9 @@ def _corners(text: str) -> tuple[int, NDArray[np.int64], Array] | None:
 
 # -- paths against the truth ------------------------------------------------------------------
 
-# Lengths of the walks [s].
+# Length of the short walks [s]. [chosen: some start-ups of odometry fit in]
 SHORT = 30.0
+# Length of the long walks [s]. [chosen: ten times as long, to show the drift]
 LONG = 300.0
 # Part of a path that is aligned before its end is compared [s].
 _ALIGNED = 5.0

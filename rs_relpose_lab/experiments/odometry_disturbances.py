@@ -34,11 +34,14 @@ from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.states import ContinuousPath, Odometry, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
-# Before and after a disturbance [s]; afterwards all is to be normal again [s].
+# Time of undisturbed motion before and after a disturbance [s]. [chosen: odometry has started]
 _MARGIN = 6.0
+# Time after a disturbance at which sigmas are to be as before [s]. [chosen: some keyframes]
 NORMAL_AGAIN = 2.0
-# Period of the published states [ns]; quantile of chi squared of 3 degrees of freedom.
+# Period of the published states [ns]. [derived: 30 Hz]
 _PERIOD_NS = 33_333_333
+# Square of an error in sigmas that 0.3 % of right states exceed. [derived: quantile of chi
+# squared of 3 degrees of freedom]
 BEYOND = float(chi2.ppf(0.997, 3))
 # Time without a sample after which odometry_node reports it [ns].
 _SILENT_NS = 250_000_000
@@ -57,6 +60,8 @@ class Disturbance(NamedTuple):
     plan: str = 'walk'  # of the motion
 
 
+# Disturbances by name. [chosen: what happens to a camera and an IMU, once short and once longer
+# than odometry bridges]
 DISTURBANCES = {
     'none': Disturbance(2.0),
     **{

@@ -35,8 +35,9 @@ from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 from rs_relpose_ros.pipeline.warm_up import warm_up
 
-# Length of the walks [s]; probability of an error beyond 3 sigma.
+# Length of the walks [s]. [chosen: they come back to places several times]
 SECONDS = 60.0
+# Probability of an error beyond three sigmas. [derived: normal distribution]
 _BEYOND = 0.0027
 
 

@@ -35,10 +35,17 @@ Values = NDArray[Any]  # real, or complex under a complex step
 
 # Unknowns, as a step from a start: rotation of R (3), tangent of t (2), tangent of gravity (2),
 # gyro corrections (6), velocities (6; left out where both cameras rest).
+# [derived: their sizes]
+# Places of the pose.
 _POSE = slice(0, 5)
+# Places of the tangent of gravity.
 _GRAVITY = slice(5, 7)
+# Places of the gyro corrections.
 _GYRO = slice(7, 13)
+# Places of the velocities.
 _VELOCITY = slice(13, 19)
+# Complex step of the derivatives, whose square is lost in rounding. [chosen: any value in
+# 1e-100..1e-20 would do]
 _STEP = 1e-30
 
 

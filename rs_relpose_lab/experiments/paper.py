@@ -196,6 +196,7 @@ _COLORS = (
     '#F0E442',
     '#000000',
 )
+# Colour of the share of lost trials. [chosen: differs from those of the methods]
 _LOST_COLOR = '#B00000'
 # Errors below this [deg] are rounding; a logarithmic axis must end somewhere.
 FLOOR = 1e-5
@@ -313,6 +314,7 @@ def _draw_levels(plot: Axes, levels: Levels, side: str, limits: tuple[float, flo
 
 # Base of the experiments; the paper names no noise.
 EXACT = Cell(pixel_noise=0.0, gravity_noise=0.0, gyro_noise=0.0, outliers=0.0, placing='image')
+# Methods of the experiments, as in `methods.METHODS`. [derived: the paper, and the node]
 METHODS_OF_THE_PAPER = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
 
 

@@ -42,6 +42,7 @@ from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_betw
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer, ImuSample
 from rs_relpose_ros.imu.filters import mean_gravity
 
+# Name of the experiment on the command line.
 EXPERIMENT = 'penncosyvio'
 
 # First and last frame of the stretches, from the paper's table 1; a frame's number is that of its
@@ -50,6 +51,7 @@ STRETCHES: Mapping[str, tuple[tuple[int, int], ...]] = {
     'as': ((206, 567), (1319, 1679), (2581, 2971), (4358, 4599)),
     'af': ((101, 551), (913, 1123), (1604, 1815), (2539, 2810)),
 }
+# Methods of the experiment, as in `methods.METHODS`.
 METHODS_OF_THE_EXPERIMENT = (
     'global_5pt',
     'uniform_9pt',
@@ -117,8 +119,10 @@ def run_penncosyvio(
     return records
 
 
-# Independent random streams of one seed.
-_IMU, _POINTS, _NOISE = range(3)
+# Independent random streams of one seed. [chosen: any three different numbers]
+_IMU = 0  # of the noise of samples
+_POINTS = 1  # of the points of the world
+_NOISE = 2  # of the matches
 
 
 class SimulatedSequence:
@@ -322,7 +326,9 @@ class RecordedMotion:
 #
 #     u - cx = x + e y          v - cy = d x + c y          ray ~ (x, y, -f(|m|))
 
+# Most steps of Newton's method in a projection. [chosen: any value in 10..100 would do]
 _MAX_STEPS = 50
+# Relative step at which it has converged. [chosen: exact to rounding in pixels]
 _SETTLED = 1e-10
 
 

@@ -31,13 +31,21 @@ from rs_relpose_lab.simulation.rows import (
 
 Noise = Literal['paper', 'gaussian']
 
+# Width of the paper's images [px]. [derived: section of the synthetic experiments, as the values
+# below]
 WIDTH = 1920
+# Height of these images [px].
 HEIGHT = 1080
+# Focal length [px].
 FOCAL = 640.0
+# Column of the principal point [px]. [derived: the middle]
 CENTRE_U = 959.5
+# Row of the principal point [px]. [derived: the middle]
 CENTRE_V = 539.5
+# Time from one row to the next [s].
 LINE_DELAY = 60e-6
 
+# Projection and row times of this camera, for `rows.observe`.
 VIEW = View(
     lambda local: FOCAL * local[:, :2] / local[:, 2:] + (CENTRE_U, CENTRE_V),
     lambda pixels: np.column_stack(
@@ -49,8 +57,10 @@ VIEW = View(
     reference_row=0.0,
 )
 
-BASELINES = {'forward': (0.0, 0.0, 2.0), 'sideways': (2.0, 0.0, 0.0)}  # [m]
-_DEPTHS = 6.0, 34.0  # [m]
+# Movement from the first camera to the second [m]. [derived: the paper]
+BASELINES = {'forward': (0.0, 0.0, 2.0), 'sideways': (2.0, 0.0, 0.0)}
+# Range of the depths of points [m]. [derived: the paper]
+_DEPTHS = 6.0, 34.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +80,8 @@ class Cell:
     placing: Literal['box', 'image'] = 'box'
 
 
+# Settings by name, as what differs from the base cell. [chosen: one thing at a time, to where an
+# estimator fails]
 _VARIATIONS: dict[str, dict[str, float]] = {
     'base': {},
     'v0-w0': {'speed': 0.0, 'rate': 0.0},

@@ -27,11 +27,13 @@ from rs_relpose_ros.odometry.states import Base
 
 Times = NDArray[np.int64]
 
-# Interval of rotations that are compared [s]; frames that are rendered, their least motion over
-# the rows [px] at a depth of 4 m.
+# Interval of the rotations that are compared [s]. [chosen: longer than between keyframes]
 _WITHIN = 0.5
+# Frames of a walk that are rendered, four times each. [chosen: to limit the time of rendering]
 _RENDERED = 4
+# Least motion over the rows of these frames [px]. [chosen: less does not show in gray values]
 _LEAST_MOTION = 3.0
+# Depth at which this motion is taken [m]. [chosen: near objects of the scenes]
 _DEPTH = 4.0
 
 

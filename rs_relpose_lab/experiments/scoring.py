@@ -24,6 +24,7 @@ class PoseError:
     nees: float = math.nan
 
 
+# Errors where there is no pose.
 NO_POSE = PoseError(math.inf, math.inf)
 
 

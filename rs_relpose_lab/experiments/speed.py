@@ -18,9 +18,13 @@ from rs_relpose_lab.experiments.problems import CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import Quantiles
 from rs_relpose_ros import warm_up
 
-THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
+# Threshold of OpenCV and PoseLib [px]. [chosen: three times the noise of the problems]
+THRESHOLD = 1.5
+# Estimates of a problem, of which the fastest counts. [chosen: leaves interruptions out]
 REPEATS = 3
+# Name of this package in the report.
 LIBRARY = 'rs_relpose_ros'
+# Method that times are compared with.
 REFERENCE = 'PoseLib, derotated points'
 # In the report; PoseLib's only where it is installed.
 COMPARED = {LIBRARY: METHODS['auto']} | {

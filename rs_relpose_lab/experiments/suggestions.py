@@ -76,6 +76,7 @@ def _focal(factor: float) -> Wrong:
     )
 
 
+# Wrong parameters by name. [chosen: of the size that users report]
 ROWS: Mapping[str, Wrong] = {
     'offset +10 ms': _offset(10.0),
     'offset -10 ms': _offset(-10.0),

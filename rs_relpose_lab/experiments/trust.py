@@ -24,8 +24,10 @@ from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 
 # Of simulated bags.
 MOTIONS = ('hand-held', 'vehicle')
-# Beyond these lie 0.27 % of right poses: three sigmas of one dimension.
+# Squared error of a direction in sigmas that 0.27 % of right poses exceed, as three sigmas of one
+# dimension. [derived: chi squared of 2 degrees of freedom]
 LIMIT_T = 11.8
+# The same of a rotation. [derived: chi squared of 3 degrees of freedom]
 LIMIT_R = 14.2
 # Seconds that a run continues after its error should have been flagged.
 _AFTERWARDS = 3.0
@@ -33,7 +35,12 @@ _AFTERWARDS = 3.0
 _NO_TEXTURE = 20.0
 
 # Independent random streams of a bag's seed.
-_DRAW, _SCENE, _MOTION, _TRACKS, _WRONG = range(10, 15)
+# [chosen: none is a stream of a simulation]
+_DRAW = 10  # of the configuration
+_SCENE = 11  # of places and textures
+_MOTION = 12  # of the trajectory
+_TRACKS = 13  # of the corners and their errors
+_WRONG = 14  # of the error of the configuration
 
 
 class BagPlan(NamedTuple):
@@ -330,6 +337,7 @@ _ROW_COLUMNS = (
     ('t error [deg]', 'direction_error', 2),
     ('claimed', 'direction_sigma', 2),
 )
+# Title, value and digits of the columns on right configurations. [derived: the report]
 _RIGHT_COLUMNS = (
     ('bags', 'bags', 0),
     ('alarms', 'alarms', 0),
@@ -345,6 +353,7 @@ _RIGHT_COLUMNS = (
     ('R error [deg]', 'rotation_error', 3),
     ('frame with pair [ms]', 'frame_ms', 1),
 )
+# Titles of the tables by kind of recording. [derived: the report]
 _TITLES = {
     trust_runs.TRACKS: 'Simulated, without images',
     trust_runs.IMAGES: 'Simulated, with images',

@@ -22,8 +22,9 @@ from rs_relpose_ros.imu.buffer import ImuSample
 
 Gray = NDArray[np.uint8]
 
-# Informative seconds of motion within which an error must be flagged.
+# Informative seconds of motion within which a gross error must be flagged. [chosen: a user waits]
 GROSS = 5
+# The same of an error that moves poses by little. [chosen: three times as long]
 SMALL = 15
 # Quantities of the laboratory's information, and their number of unknowns.
 QUANTITIES: Mapping[str, int] = {
@@ -44,6 +45,7 @@ class Geometry(NamedTuple):
     image: Callable[[Gray, RollingShutterCamera], Gray]
 
 
+# The image as the sensor has it.
 AS_IT_IS = Geometry(lambda points, camera: points, lambda image, camera: image)
 
 
@@ -287,16 +289,23 @@ def _reversed_order(columns: bool, rows: bool) -> Geometry:
     )
 
 
+# The image without distortion, although the CameraInfo has one.
 RECTIFIED = Geometry(_rectified, _rectified_image)
+# The image of a camera that is mounted upside down, turned by the driver.
 UPSIDE_DOWN = _reversed_order(columns=True, rows=True)
+# Rows in reverse order.
 FLIPPED = _reversed_order(columns=False, rows=True)
+# Columns in reverse order.
 MIRRORED = _reversed_order(columns=True, rows=False)
 
 # Scales and angles of the axes of a cheap gyro.
 _GYRO_MATRIX = np.array([[1.015, 0.004, 0.0], [0.004, 0.985, -0.004], [0.0, -0.004, 1.01]])
+# IMU whose x and y axes are negated.
 _HALF_ROTATION = Rotation.from_rotvec([0.0, 0.0, math.pi])
+# IMU whose axes are exchanged: x, y, z are y, z, x.
 _CYCLE = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
+# Name of the row without an error. [derived: the report]
 RIGHT = 'right'
 ROWS: Mapping[str, Row] = {
     RIGHT: Row((), SMALL, lambda right, rng: right),
@@ -388,11 +397,14 @@ ROWS: Mapping[str, Row] = {
 #
 # Nothing of `rs_relpose_ros.estimator` or `rs_relpose_ros.health` is used.
 
+# End of each quantity in the vector of all unknowns. [derived: their sizes]
 _ENDS = dict(zip(QUANTITIES, accumulate(QUANTITIES.values()), strict=True))
+# Places of each quantity in it. [derived: the ends]
 PLACES: Mapping[str, slice] = {
     name: slice(end - QUANTITIES[name], end) for name, end in _ENDS.items()
 }
 _UNKNOWNS = 11  # x: rotation, direction of translation, velocities
+# Number of all these unknowns. [derived: their sizes]
 _FREE = sum(QUANTITIES.values())
 # Of the finite differences, in the units of `Injected` and of x.
 _STEP = 1e-5
@@ -400,8 +412,9 @@ _STEP = 1e-5
 _BEFORE = np.repeat([0.5, 0.1, 0.05, 0.1, 0.2, 0.3, 0.3], list(QUANTITIES.values()))
 # Velocities differ from t / interval by so many baselines per second, 1 sigma.
 _VELOCITY_SIGMA = 1.0
-# Least noise of a match [px] and of a rotation by the gyro [rad]: no model is better.
+# Least noise of a match [px]: no model of a camera is better. [chosen: 0.02 to 0.1 would do]
 _LEAST_PIXEL = 0.05
+# Least noise of a rotation by the gyro [rad], as of a match. [chosen: 1e-4 to 1e-3 would do]
 _LEAST_ROTATION = 3e-4
 # An injected error must be so many times its sigma.
 INFORMATIVE = 5.0

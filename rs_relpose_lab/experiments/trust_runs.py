@@ -49,8 +49,9 @@ Ids = NDArray[np.int64]
 # Pixels (N, 2) of the sensor to those of the published image.
 PointMap = Callable[[Array], Array]
 
-# Corners in sight, of which a tracker takes its 300; least distance between new ones [px].
+# Corners in sight, of which a tracker takes its 300. [chosen: some are too near to others]
 _IN_SIGHT = 420
+# Least distance between new corners [px]. [chosen: as `min_feature_distance`]
 _LEAST_DISTANCE = 10.0
 # Share of the corners that are lost from frame to frame, though in sight.
 _LOST = 0.01
@@ -296,9 +297,11 @@ class Arrival(NamedTuple):
     arrives_ns: int
 
 
-# Kinds of recordings: simulated, without images and with them, and others.
+# Kind of a simulated recording without images. [derived: the report, as those below]
 TRACKS = 'tracks'
+# Kind of a simulated recording with images.
 IMAGES = 'images'
+# Kind of a recording of a camera.
 RECORDING = 'recording'
 
 

@@ -32,10 +32,14 @@ from rs_relpose_ros.config.files import file_values
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import stamp_ns
 
-# Of the bag [Hz], of which other cases take each second image; length of a case [s].
+# Images per second of the bag, of which a case sends each second one unless it says otherwise.
+# [chosen: a fast camera]
 FPS = 60
+# Length of a case [s]. [chosen: a finding needs some seconds]
 SECONDS = 10.0
+# Readout time of the camera [s]. [chosen: of usual cameras]
 READOUT = 0.02
+# Topics below the name of the camera or IMU, by type.
 _TOPICS = {
     Image: 'image',
     CompressedImage: 'image/compressed',
@@ -161,8 +165,11 @@ def _rotated(degrees: float) -> dict[str, Any]:
     }
 
 
+# Types of the messages of the camera.
 _IMAGES = (Image, CameraInfo)
+# Parameter with the rotation between IMU and camera.
 _AXES = 'quat_cam_imu_xyzw'
+# Cases in the order of the report. [chosen: what drivers and users do wrong]
 _CASES = (
     Case('axes 180 deg', _AXES, parameters=_rotated(180.0)),
     Case('axes 3 deg', _AXES, parameters=_rotated(3.0)),
@@ -235,6 +242,7 @@ _CASES = (
         (shifted(Image, lambda number, _: 0.0 if number % 3 else 1e6),),
     ),
 )
+# Cases by name.
 CASES = {case.name: case for case in _CASES}
 
 

@@ -38,7 +38,10 @@ from rs_relpose_ros.nodes.inputs import message_class
 # CDR: 4 bytes of encapsulation (the second one is the byte order), then sec and nanosec of the
 # std_msgs/Header at the begin of the message.
 _STAMP = slice(4, 12)
+# The last images end this long before the last sample of the IMU [ns], which so covers their
+# rows. [chosen: above the readout of an image]
 _TAIL_NS = NANOSECONDS // 20
+# Types of images.
 _IMAGES = (sensor_topics.IMAGE, sensor_topics.COMPRESSED_IMAGE)
 
 
@@ -114,6 +117,7 @@ LOG_DTYPE = np.dtype(
 
 # Types that the node subscribes to: the player waits for these subscriptions.
 _SENSOR_TYPES = (*_IMAGES, sensor_topics.CAMERA_INFO, sensor_topics.IMU)
+# Queue length of the publishers. [chosen: a second of an IMU at 1 kHz]
 _DEPTH = 1000
 # Between the match on the publisher's side and that on the subscriber's, messages are lost [s].
 _SETTLE = 0.5

@@ -11,16 +11,24 @@ from rs_relpose_lab.simulation.trajectory import Segment, Trajectory
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 
+# Kinds of motion that a plan may name. [derived: `_levels`]
 KINDS = ('walk', 'constant', 'still', 'rotate')
 
+# Time between control points [s]. A longer one makes tremor impossible, a shorter one only costs
+# time. [chosen: 30 ms represents the fastest sinusoid of `_ROTATIONS`, 4.3 Hz]
 CONTROL_SPACING = 0.03
 # Time [s] in which one kind of motion passes into the next: a ramp of the control points, three
 # further ones on either side because a point of the spline depends on several.
 _RAMP = 10 * CONTROL_SPACING
+# The same with the control points beside the ramp [s]. [derived: degree 5 of the spline]
 _TRANSITION = _RAMP + 6 * CONTROL_SPACING
 
+# Height of a camera held by a person who walks [m]. [chosen: eye height]
 EYE_HEIGHT = 1.6
+# Distance from the middle of the scene at which the walk turns back [m]. A larger one leads into
+# what stands around. [chosen: crates and posts are 5 m away]
 _ARENA_RADIUS = 1.3
+# Steps per second of a person who walks. [chosen: a usual gait, 1.6 to 2.2]
 _STEP_FREQUENCY = 1.8
 
 # Amplitude [deg], frequency [Hz] and axis (yaw, pitch, roll) of the rotation: looking around,
@@ -226,20 +234,31 @@ def _angles(
 
 # -- A wheeled robot as a trajectory: it drives forward, stops, and rocks on its springs ---
 
-# Height of the camera [m], and distance from the middle of the scene at which the robot returns.
+# Height of the camera of the robot [m]. [chosen: on a mast; a lower one sees more of the floor]
 _ROBOT_HEIGHT = 1.2
-# Yaw rates [rad/s]: of steering about, and largest of the way back to the middle.
+# Yaw rate of steering about [rad/s]. A larger one blurs images. [chosen: any value in 10..30 deg/s
+# would do]
 _WANDER_RATE = math.radians(18.0)
+# Largest yaw rate of the way back to the middle [rad/s]. A smaller one leads out of the scene.
+# [chosen: any value in 30..80 deg/s would do]
 _HOMING_RATE = math.radians(50.0)
-# Rocking of pitch and roll on the springs: natural frequency [Hz], damping, rms [rad].
+# Natural frequency of pitch and roll on the springs [Hz]. [chosen: of small vehicles, 1 to 2]
 _SPRING_FREQUENCY = 1.4
+# Damping ratio of the springs. [chosen: worn shock absorbers, 0.2 to 0.4]
 _DAMPING = 0.25
+# Rms of pitch and roll on the springs while the robot drives [rad]. [chosen: a floor that is
+# nearly even]
 _ROCKING = math.radians(0.7)
 # Lean [rad] per acceleration [m/s^2]: nose down in braking, outwards in a turn.
 _LEAN = math.radians(1.0)
+# Rms of the height on the springs while the robot drives [m]. [chosen: as the rocking of a wheel
+# base of half a metre]
 _HEAVE = 0.006
-# One stop in so many seconds; how long it takes, with braking and starting.
+# Time from one stop to the next [s]. A longer one leaves short recordings without a stop.
+# [chosen: any value in 5..20 would do]
 _STOP_EVERY = 9.0
+# Duration of a stop with braking and starting [s]. [chosen: a third of it is rest, long enough
+# for a bias at rest]
 _STOP = 2.4
 
 

@@ -20,11 +20,14 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 _TILE = 40
 # A lookup covers a footprint that is this much longer than wide; a longer one takes several.
 _TAP_STRETCH = 1.6
+# Most lookups along the longer axis of a footprint. Fewer blur surfaces at a slant, more cost
+# time. [chosen: any value in 4..16 would do]
 _MAX_TAPS = 6
 # Slightly sharper than the textbook choice of mip level, whose filter is wider than a pixel.
 _LEVEL_BIAS = -0.35
 # An exposure is sampled at times between which the nearest surface moves by at most this [px].
 _EXPOSURE_STEP = 1.0
+# Gray value where no surface is hit. [chosen: the middle of the range]
 _NOTHING = 128.0
 
 # Nothing here lets the compiler fuse operations: the same image on every processor.
@@ -178,19 +181,29 @@ class _Exposure(NamedTuple):
     pixel_angle: float  # [rad] in the middle of the image
 
 
-# Columns of a face, a surface from one row's position: unit normal, height of the camera
-# above its plane; axes of its texture and the camera's own place along them; size; the surface's
-# index; direction and half angle of a cone around it.
+# Columns of a face, which is a surface as it lies to the camera at one row. Each constant is the
+# first column of its values. [derived: one after the other]
+# Unit normal (3).
 _NORMAL = 0
+# Height of the camera above the plane [m].
 _HEIGHT = 3
+# Axis of the rows of the texture (3).
 _ACROSS = 4
+# Place of the camera along the texture's rows [m].
 _A = 7
+# Axis of the columns of the texture (3).
 _DOWN = 8
+# Place of the camera along the texture's columns [m].
 _B = 11
+# Width and height [m].
 _SIZE = 12
+# Index of the surface.
 _INDEX = 14
+# Direction (3) of the axis of a cone around the surface.
 _TOWARDS = 15
+# Half angle of this cone [rad].
 _ANGLE = 18
+# Number of the columns.
 _FACE_COLUMNS = 19
 
 

@@ -17,9 +17,14 @@ Array = NDArray[np.float64]
 # one's time. Time 0 is that of the reference row.
 Motion = Callable[[Array, Array], Array]
 
+# Distance of the assumed row from the projected one at which the row is found [px]. [chosen: far
+# below the noise of any match, above rounding]
 _SETTLED_ROWS = 1e-9
+# Rounds after which the row of a point is given up: secants settle in a few. [chosen: any value
+# in 10..100 would do]
 _MAX_ROUNDS = 30
-_LEAST_DEPTH = 0.1  # [m]
+# A nearer point does not appear in an image [m]. [chosen: no scene has one]
+_LEAST_DEPTH = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

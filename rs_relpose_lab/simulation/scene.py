@@ -19,9 +19,16 @@ from rs_relpose_ros.geometry import Array
 
 # Smallest wavelength of the noise [texels]; bilinear lookups reproduce what is longer.
 _SHORTEST_WAVELENGTH = 4.0
+# 1 sigma of the noise of a texture [gray levels]. More hides shapes, less leaves flat areas.
+# [chosen: any value in 5..25 would do]
 _NOISE_SIGMA = 12.0
+# Area of the canvas for each shape [texels]. [chosen: shapes cover each other several times]
 _TEXELS_PER_SHAPE = 900.0
+# Size of the smallest shapes [texels]. Smaller ones are below the resolution of the camera.
+# [chosen: a pixel of the camera has about one texel]
 _SMALLEST_SHAPE = 5.0
+# Half of the side below which a panel is not divided [texels]. [chosen: corners stay several
+# pixels apart]
 _SMALLEST_PANEL = 14
 
 
@@ -141,8 +148,10 @@ def _fixed(coordinates: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.rint(coordinates * (1 << _SHIFT)).astype(np.int32)
 
 
+# Scenes of walks. [derived: the functions of `make_scene`]
 SCENES = ('hall', 'yard', 'gallery')
-# Those of walks, and a single plane that fills the view, which benchmarks of walks do not use.
+# Scenes of walks, and a single plane that fills the view, which benchmarks of walks do not use.
+# [derived: the functions of `make_scene`]
 ALL_SCENES = (*SCENES, 'wall')
 
 # The camera stays within this distance of the origin's vertical [m].
@@ -150,8 +159,12 @@ _ARENA = 3.5
 
 # A texel is this part of the pixel's footprint at the nearest distance, square on.
 _TEXELS_PER_FOOTPRINT = 0.9
+# Distance below which textures are not made finer [m]. [chosen: walks keep this distance]
 _NEAREST = 2.5
+# The same for the floor [m]. [chosen: a camera at eye height that looks ahead sees it from there
+# on]
 _FLOOR_DISTANCE = 4.0
+# Middle of the walks [m]. [derived: the origin at eye height]
 _ROOT = np.array([0.0, 0.0, 1.6])
 
 

@@ -16,6 +16,8 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 
+# Acceleration of free fall in the world, whose z axis points upwards [m/s^2]. [derived: ISO
+# 80000-3]
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 
@@ -51,10 +53,17 @@ class ImuModel:
 
 # IMU and truth begin and end this long before the first and after the last row [s].
 _MARGIN = 0.1
+# The trajectory is defined for this long before and after the recording [s]. [chosen: above the
+# margin of the IMU and the readout of an image]
 _MOTION_MARGIN = 0.5
 
 # Independent random streams of one seed: what one of them draws leaves the others alone.
-_MOTION, _SCENE, _IMU, _BIAS, _IMAGE = range(5)
+# [chosen: any five different numbers]
+_MOTION = 0  # of the trajectory
+_SCENE = 1  # of places and textures
+_IMU = 2  # of the noise of samples
+_BIAS = 3  # of the error of the calibrated gyro bias
+_IMAGE = 4  # of the noise of images
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,8 @@ from rs_relpose_lab.simulation.rows import Motion
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 
+# Degree of the spline: accelerations have two continuous derivatives. With a smaller one the IMU
+# and the rows of an image would see corners of the motion. [chosen: 4 to 7 would do]
 DEGREE = 5
 
 # Columns: camera x (right), y (down), z (forward) in the body's axes.
