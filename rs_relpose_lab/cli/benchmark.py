@@ -1,7 +1,7 @@
 """``rs_relpose benchmark``: measurements of the package; see benchmarks/README.md."""
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from importlib import import_module
@@ -333,7 +333,6 @@ def _run_speed(args: argparse.Namespace) -> int:
 )
 def _run_live(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import live
-    from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
 
     names = matching_cells(args.cells, live.CELLS)
     cells = [live.CELLS[name] for name in names]
@@ -346,10 +345,20 @@ def _run_live(args: argparse.Namespace) -> int:
                 '--neighbours'
             )
         return _compare_checkouts(names, args)
+    results = list(_measured_live(cells, load, args))
+    if results:
+        _print_report(live.write_report(args.output, results), args.output)
+    return int(len(results) < len(cells))
+
+
+def _measured_live(cells: Sequence[Any], load: Any, args: argparse.Namespace) -> Iterator[Any]:
+    """Statistics of each cell that can be measured; the reason of another one is printed."""
+    from rs_relpose_lab.experiments import live
+    from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
+
     sizes = sorted({(cell.width, cell.height) for cell in cells})
     with progress_bar(len(sizes) * round(FPS * PERIOD), 'frame', 'rendering') as bar:
         clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
-    results = []
     with progress_bar(round(len(cells) * load.duration), 's') as bar:
         for cell in cells:
             bar.set_description(cell.name)
@@ -361,12 +370,9 @@ def _run_live(args: argparse.Namespace) -> int:
             except RsRelposeError as error:  # the other cells are still measured
                 print(f'{cell.name}: {error}', file=sys.stderr)
                 continue
-            results.append(statistics)
             if args.soak:
                 print(live.write_soak_report(folder, statistics, course))
-    if results:
-        _print_report(live.write_report(args.output, results), args.output)
-    return int(len(results) < len(cells))
+            yield statistics
 
 
 def _compare_checkouts(names: Sequence[str], args: argparse.Namespace) -> int:

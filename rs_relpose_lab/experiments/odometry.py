@@ -78,16 +78,8 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
         with tarfile.open(folder / 'cam0_corners.tar.gz') as archive:
             files = [archive.extractfile(member) for member in archive if member.isfile()]
             found = [_corners(file.read().decode()) for file in files if file is not None]
-        imu = np.loadtxt(folder / 'imu0.csv', delimiter=',', comments='#', usecols=range(1, 7))
-        imu_ns = np.loadtxt(
-            folder / 'imu0.csv', dtype=np.int64, delimiter=',', comments='#', usecols=0
-        )
-        poses = np.loadtxt(
-            folder / 'gt_pnp_cam0.csv', delimiter=',', skiprows=1, usecols=range(3, 10)
-        )
-        stamps = np.loadtxt(
-            folder / 'gt_pnp_cam0.csv', dtype=np.int64, delimiter=',', skiprows=1, usecols=0
-        )
+        imu_ns, imu = _series(folder / 'imu0.csv', range(1, 7))
+        stamps, poses = _series(folder / 'gt_pnp_cam0.csv', range(3, 10), header=1)
     except OSError as error:
         raise MissingInputError(f"there are no corners of EuRoC's in {folder}: {error}") from error
     frames = sorted((frame for frame in found if frame is not None), key=lambda frame: frame[0])
@@ -135,6 +127,13 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
         imu[:, :3] @ C.T,
     )
     return recording, truth
+
+
+def _series(path: Path, columns: range, header: int = 0) -> tuple[NDArray[np.int64], Array]:
+    """Stamps [ns] in the first column of a table, and the values of some columns."""
+    stamps = np.loadtxt(path, dtype=np.int64, delimiter=',', skiprows=header, usecols=0)
+    values = np.loadtxt(path, delimiter=',', skiprows=header, usecols=columns)
+    return stamps, values
 
 
 def _corners(text: str) -> tuple[int, NDArray[np.int64], Array] | None:

@@ -249,6 +249,28 @@ def _limits(errors: Sequence[Array]) -> tuple[float, float]:
     return low, max(min(10.0 ** np.ceil(most), 180.0), 10.0 * low)
 
 
+def _draw_boxes(plot: Axes, values: Mapping[float, Array], width: float, color: str) -> None:
+    """Draw a box of values at each position, with whiskers to the 5th and 95th percentile."""
+    plot.boxplot(
+        list(values.values()),
+        positions=list(values),
+        widths=width,
+        whis=(5.0, 95.0),
+        patch_artist=True,
+        manage_ticks=False,
+        boxprops={'facecolor': color, 'linewidth': 0.6},
+        medianprops={'color': 'black', 'linewidth': 1.4},
+        whiskerprops={'linewidth': 0.7},
+        capprops={'linewidth': 0.7},
+        flierprops={
+            'marker': '.',
+            'markersize': 3.5,
+            'markerfacecolor': color,
+            'markeredgecolor': color,
+        },
+    )
+
+
 def _draw_levels(plot: Axes, levels: Levels, side: str, limits: tuple[float, float]) -> None:
     methods = list(next(iter(levels.values())))
     step = 0.86 / len(methods)
@@ -275,24 +297,7 @@ def _draw_levels(plot: Axes, levels: Levels, side: str, limits: tuple[float, flo
             if len(errors.rotation):
                 shown[position] = np.maximum(getattr(errors, side), FLOOR)
         if shown:
-            plot.boxplot(
-                list(shown.values()),
-                positions=list(shown),
-                widths=0.8 * step,
-                whis=(5.0, 95.0),
-                patch_artist=True,
-                manage_ticks=False,
-                boxprops={'facecolor': color, 'linewidth': 0.6},
-                medianprops={'color': 'black', 'linewidth': 1.4},
-                whiskerprops={'linewidth': 0.7},
-                capprops={'linewidth': 0.7},
-                flierprops={
-                    'marker': '.',
-                    'markersize': 3.5,
-                    'markerfacecolor': color,
-                    'markeredgecolor': color,
-                },
-            )
+            _draw_boxes(plot, shown, 0.8 * step, color)
     if any(errors.lost for row in levels.values() for errors in row.values()):
         plot.text(-0.49, strip, 'no pose:', fontsize=7, va='center', color=_LOST_COLOR)
     plot.set_yscale('log')

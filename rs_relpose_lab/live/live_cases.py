@@ -268,13 +268,9 @@ def play(
         ),
         folder,
     )
+    given = {**file_values(file), 'image_transport': 'raw', **case.parameters}
     values = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in {
-            **file_values(file),
-            'image_transport': 'raw',
-            **case.parameters,
-        }.items()
+        name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
     }
     named = math.nan
     messages = _messages(bag, case)
@@ -282,20 +278,7 @@ def play(
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         references = graph.listen(TimeReference, '/relpose_node/reference')
-        publishers = {
-            kind: graph.node.create_publisher(
-                kind,
-                topic,
-                QoSProfile(
-                    depth=200,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL
-                    if case.latched and kind is CameraInfo
-                    else DurabilityPolicy.VOLATILE,
-                ),
-            )
-            for kind, topic in _TOPICS.items()
-            if kind in {type(item) for _, item in messages}
-        }
+        publishers = _publishers(graph, case, {type(item) for _, item in messages})
         clock = graph.node.create_publisher(Clock, '/clock', 10) if case.clock else None
         node.wait_for('ready: ')
         time.sleep(1.0)
@@ -314,6 +297,20 @@ def play(
                     named = due
     last = [status.message for item in diagnostics for status in item.status]
     return bag, named, poses, references, last[-1] if last else ''
+
+
+def _publishers(graph: Graph, case: Case, kinds: set[type]) -> dict[type, Any]:
+    """Publishers of a case by the types of its messages."""
+    publishers = {}
+    for kind, topic in _TOPICS.items():
+        if kind in kinds:
+            is_latched = case.latched and kind is CameraInfo
+            durability = (
+                DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE
+            )
+            profile = QoSProfile(depth=200, durability=durability)
+            publishers[kind] = graph.node.create_publisher(kind, topic, profile)
+    return publishers
 
 
 def _messages(bag: Path, case: Case) -> list[tuple[float, Any]]:
