@@ -300,12 +300,11 @@ class FrameStatistics(ABC):
             if warning and level == OK:
                 level = WARN
                 text = warning
-            by_level = {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}
-            state = self.idle if problem else by_level[level]
+            state = 'calibrating' if progress is not None else self._state(level, problem)
             values: dict[str, object] = {'state': state, 'missing': ', '.join(missing)}
             if progress is not None:
-                share = f'{100.0 * progress.share:.0f}'
-                values.update(state='calibrating', progress=share, **progress.values)
+                values['progress'] = f'{100.0 * progress.share:.0f}'
+                values |= progress.values
             for role in TOPICS:
                 arrived = inputs[role] - before[role]
                 values[f'{role.value}_rate_hz'] = f'{arrived / elapsed:.1f}'
@@ -319,6 +318,12 @@ class FrameStatistics(ABC):
             silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
         texts = tuple((name, str(value)) for name, value in values.items())
         return Report(level, text, texts, silence)
+
+    def _state(self, level: int, problem: str) -> str:
+        """What the node does, in a word."""
+        if problem:
+            return self.idle
+        return {OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level]
 
     def _counters(
         self, counts: SequencerCounts | None, refused: Counter[Refusal], invalid: int

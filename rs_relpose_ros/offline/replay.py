@@ -5,7 +5,7 @@ list, and `replay_into` and `pairs_into` write them into a folder.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 import csv
 from dataclasses import dataclass
@@ -454,18 +454,24 @@ def related(
         elif isinstance(outcome, MessageRefused):
             outcome.raise_without_intrinsics()
         elif outcome.stamp_ns is not None:
-            problems.setdefault(outcome.stamp_ns, outcome.reason)
+            text = f'the image of {outcome.stamp_ns} cannot be used: {outcome.reason}'
+            problems.setdefault(outcome.stamp_ns, text)
 
-    def reason(first: int, second: int) -> str:
-        if first >= second:
-            remedy = 'give two different images' if first == second else 'exchange them'
-            return f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: {remedy}'
-        for stamp in (first, second):
-            if stamp not in intake.stamps_found:
-                return f'no image on {topics.image.name} has the stamp {stamp}'
-            if stamp in problems:
-                return f'the image of {stamp} cannot be used: {problems[stamp]}'
-        return 'the clock of the images jumped back between the two'
-
-    found = [results[pair] if pair in results else reason(*pair) for pair in pairs]
+    for stamp in stamps - intake.stamps_found:
+        problems[stamp] = f'no image on {topics.image.name} has the stamp {stamp}'
+    found = [
+        results[pair] if pair in results else _why_not_estimated(pair, problems) for pair in pairs
+    ]
     return found, intake.intrinsics
+
+
+def _why_not_estimated(pair: PairStamps, problems: Mapping[int, str]) -> str:
+    """Why a pair has no result; `problems` are those of its images, by their stamps."""
+    first, second = pair
+    if first >= second:
+        remedy = 'give two different images' if first == second else 'exchange them'
+        return f'{LIST_COLUMNS[0]} must be before {LIST_COLUMNS[1]}: {remedy}'
+    for stamp in pair:
+        if stamp in problems:
+            return problems[stamp]
+    return 'the clock of the images jumped back between the two'

@@ -190,7 +190,7 @@ def _compared(
     before: NDArray[np.float32], now: NDArray[np.float32], motion: Array
 ) -> tuple[Flags, Array, Flags]:
     """Which cells (ROWS, COLUMNS) are informative, the change E of all, and which are still."""
-    height, width = before.shape
+    width = before.shape[1]
     # Content that comes from far outside the image is not known. A wrong gyro makes motions of
     # many image widths, which `remap` would reflect at the border one width at a time.
     known = (np.abs(motion) < width).all(axis=2)  # NaN is not known either
@@ -199,16 +199,22 @@ def _compared(
     turned = known & (lengths >= _LEAST_MOTION)
     if not turned.any():
         return turned, np.zeros(turned.shape), turned
-    dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-    # The content of a pixel comes from where the motion began.
-    u = np.arange(width, dtype=np.float32) - dense[..., 0]
-    v = np.arange(height, dtype=np.float32)[:, np.newaxis] - dense[..., 1]
-    moved = cv2.remap(before, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    expected = _cell_means(np.abs(moved - before))
+    expected = _cell_means(np.abs(_moved(before, field) - before))
     changed = _cell_means(np.abs(now - before))
     informative = turned & (expected >= _LEAST_CHANGE)
     still = changed < _STILL * expected
     return np.asarray(informative), expected, np.asarray(still)
+
+
+def _moved(image: NDArray[np.float32], field: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image W(I) whose content has moved by a field (ROWS, COLUMNS, 2) [px]."""
+    height, width = image.shape
+    dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
+    # The content of a pixel comes from where the motion began.
+    u = np.arange(width, dtype=np.float32) - dense[..., 0]
+    v = np.arange(height, dtype=np.float32)[:, np.newaxis] - dense[..., 1]
+    moved = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(moved, dtype=np.float32)
 
 
 def _cell_means(values: NDArray[np.float32]) -> Array:
