@@ -118,7 +118,9 @@ def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
         ([1.0, 2.0], [0.1, 0.1], 1.5, 0.5, 50.0, ()),
     ],
 )
-def test_weighted_mean(values, sigmas, mean, sigma, chi2, outliers):
+def test_values_are_averaged_by_their_sigmas_without_outliers(
+    values, sigmas, mean, sigma, chi2, outliers
+):
     combined = batch.weighted_mean('x', 'abcdef'[: len(values)], values, sigmas)
     assert [combined[key] for key in ('mean', 'sigma', 'chi2')] == pytest.approx(
         [mean, sigma, chi2]
@@ -449,7 +451,9 @@ def test_summary_of_calibrations(client, tmp_path):
         (['replay', 'x', '--scheduler', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers'),
     ],
 )
-def test_bad_usage(tmp_path, capsys, monkeypatch, words, configured):
+def test_bad_usage_is_named_and_nothing_is_written(
+    tmp_path, capsys, monkeypatch, words, configured
+):
     monkeypatch.setattr('rs_relpose_ros.cli.batch._TIMEOUT', 1.0)
     assert main.main(['batch', *words, '--out', str(tmp_path / 'out')]) == 2
     assert configured in capsys.readouterr().err

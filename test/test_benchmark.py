@@ -347,7 +347,7 @@ def test_differing_poses_are_found(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_demo():
+def test_the_demo_prints_its_table_and_draws_its_pictures():
     """The demo itself: three processes over DDS, replays, and the table."""
     done = subprocess.run(
         [sys.executable, ROOT / 'demo' / 'run_demo.py'],

@@ -258,7 +258,7 @@ def test_phone_in_a_car(converted, tmp_path):
 
 
 @pytest.mark.recordings
-def test_slow_hand(converted, tmp_path):
+def test_a_hand_that_turns_too_slowly_leaves_the_readout_time_open(converted, tmp_path):
     """Its README: 31.5 ms; offset -56 to -60 ms by the exposure.
 
     4.8 s at 3 to 4 deg/s are too little for the readout time, which is not observable. It and the

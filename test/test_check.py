@@ -729,7 +729,7 @@ def test_every_container(kind, offered, reliability, tmp_path):
     assert findings['imu rate'].finding.evidence.measured['reliability'] == reliability
 
 
-def test_command_line(tmp_path, capsys):
+def test_the_command_prints_ok_lines_and_fails_for_a_bad_bag(tmp_path, capsys):
     good = Small().write(tmp_path / 'good')
     bad = broken(info=uncalibrated).write(tmp_path / 'bad')
     options = ['--set', 'readout_time=0.02', '--set', 'quat_cam_imu_xyzw=[0, 0, 0, 1]']
@@ -755,7 +755,7 @@ def test_command_line(tmp_path, capsys):
         (['DAMAGED'], 'mcap'),
     ],
 )
-def test_bad_usage(arguments, message, tmp_path, refused):
+def test_bad_usage_is_refused(arguments, message, tmp_path, refused):
     for name in ('BAG', 'DAMAGED'):
         broken(seconds=0.3).write(tmp_path / name)
     damaged = tmp_path / 'DAMAGED' / 'DAMAGED.mcap'

@@ -102,7 +102,7 @@ def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
         ),
     ],
 )
-def test_launch_files(name, texts):
+def test_launch_files_contain_their_nodes_and_arguments(name, texts):
     """Without ROS's launch, which is in no wheel, by their text alone."""
     text = (ROOT / 'launch' / f'{name}.launch.py').read_text(encoding='utf-8')
     assert [part for part in texts if part not in text] == []

@@ -193,7 +193,9 @@ def write_profile(path: Path, **changes: object) -> Path:
         ('Acme/one.json', {'frame_readout_time': 15.25}, (0.01525, 'down')),
     ],
 )
-def test_lens_profile(tmp_path, place, header, readout):
+def test_the_lens_profile_of_the_video_gives_its_lens_and_readout(
+    tmp_path, place, header, readout
+):
     folder = tmp_path / 'profiles'
     write_profile(folder / 'Acme' / 'one.json', **OF_THE_VIDEO)
     write_profile(folder / 'Acme' / 'rate.json')
@@ -329,7 +331,7 @@ def test_video_that_is_refused(tmp_path, make, words):
 # --- phones
 
 
-def test_posecam(tmp_path):
+def test_a_posecam_folder_becomes_a_bag(tmp_path):
     read = converted('android', made.make_posecam(tmp_path / 'in'), tmp_path / 'bag')
     assert read.stamps() == [stamp for number, stamp in enumerate(made.STAMPS) if number != 2]
     assert read.of(IMAGES)[2].data.tobytes() == made.picture(3)
@@ -399,7 +401,7 @@ def test_axes_by_sensor_orientation(tmp_path, degrees):
 
 
 @pytest.mark.parametrize('clock, difference', [('REALTIME', 0), ('UNKNOWN', 123_456_789)])
-def test_mars(tmp_path, clock, difference):
+def test_a_mars_logger_folder_becomes_a_bag_on_the_clock_of_the_imu(tmp_path, clock, difference):
     folder = made.make_mars(tmp_path / 'in', clock, difference)
     read = converted('android', folder, tmp_path / 'bag')
     assert read.stamps() == made.STAMPS  # on the IMU's clock
@@ -417,7 +419,7 @@ def test_mars(tmp_path, clock, difference):
 
 
 @pytest.mark.parametrize('as_video', [False, True])
-def test_tables(tmp_path, as_video):
+def test_a_folder_of_tables_becomes_a_bag_with_or_without_accelerometer(tmp_path, as_video):
     folder = made.make_tables(tmp_path / 'in', as_video=as_video)
     read = converted('android', folder, tmp_path / 'bag')
     assert read.stamps() == made.STAMPS
@@ -473,7 +475,7 @@ def test_realsense_folder(tmp_path):
     assert message.linear_acceleration_covariance[0] != -1.0
 
 
-def test_xiaomi_folder(tmp_path):
+def test_a_xiaomi_folder_becomes_a_bag_with_its_lens(tmp_path):
     folder = made.make_xiaomi(tmp_path / 'in')
     read = converted('xiaomi_cc9_rs', folder, tmp_path / 'bag')
     check_delays(read, 31_100_000)
@@ -590,7 +592,7 @@ INVALID = [
     'name, damage, words, kind',
     [*((*row, MissingInputError) for row in MISSING), *((*row, InputError) for row in INVALID)],
 )
-def test_damaged_folder(tmp_path, name, damage, words, kind):
+def test_a_damaged_folder_is_refused_with_its_reason(tmp_path, name, damage, words, kind):
     folder = (MAKE.get(name) or getattr(made, f'make_{name}'))(tmp_path / 'in')
     damage(folder)
     source = {'realsense': 'realsense_rgb_rs', 'xiaomi': 'xiaomi_cc9_rs'}.get(name, 'android')
@@ -698,7 +700,7 @@ def rotates_as_its_images(read: Converted) -> None:
 
 
 @pytest.mark.recordings
-def test_gopro(recordings, tmp_path):
+def test_a_gopro_video_becomes_a_bag_with_its_telemetry(recordings, tmp_path):
     read = converted('video', recordings / 'gopro_samples' / 'karma.mp4', tmp_path / 'bag')
     assert [stamp - START_NS for stamp in read.stamps()] == [
         round(k * 1001 / 30000 * 1e9) for k in range(362)

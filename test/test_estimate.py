@@ -73,7 +73,7 @@ def test_a_pair_without_consensus_has_few_samples():
     ],
     ids=str,
 )
-def test_accuracy(cell, rotation, translation):
+def test_errors_of_poses_are_small_and_outliers_are_found(cell, rotation, translation):
     """Medians over 8 scenes; the last case is without gravity. Outliers are found."""
     errors = []
     found = []

@@ -266,7 +266,9 @@ def test_the_odometry_is_run_if_it_is_not_given(bundled_bag, rows, tmp_path):
         (('--format', 'gsplat', '--trajectory', 'none'), 'does not exist: `rs_relpose odometry`'),
     ],
 )
-def test_bad_options(options, words, bundled_bag, tmp_path, refused):
+def test_bad_options_are_refused_and_nothing_is_written(
+    options, words, bundled_bag, tmp_path, refused
+):
     refused(words, 'export', bundled_bag, tmp_path / 'model', *PARAMS, *options)
     assert list(tmp_path.iterdir()) == []
 

@@ -626,7 +626,7 @@ def test_uncertain_direction_is_decided_by_all_frames(scene):
         (lambda f: [replace(f[0], relative_rotation_covariance=-np.eye(3))], 'covariance'),
     ],
 )
-def test_wrong_arguments(scene, change, message):
+def test_wrong_arguments_are_named(scene, change, message):
     with pytest.raises(InputError, match=message):
         scene.pose(between=change(scene.between))
 

@@ -188,7 +188,7 @@ def receive(seed: int, plan: list[Any]) -> Counter[str]:
 
 
 @share_and_all(50, 1250, 1300)
-def test_damaged_messages(count):
+def test_damaged_messages_are_refused_and_good_ones_get_through(count):
     outcomes = outcomes_of(
         receive, count, st.integers(0, 2**32 - 1), st.lists(damages, min_size=80, max_size=80)
     )
@@ -232,7 +232,7 @@ def read(bag: Path) -> str:
 
 @pytest.mark.timeout(600)  # the kernels may not be compiled yet
 @share_and_all(100, 10_000, 3700)
-def test_damaged_bags(tmp_path, count):
+def test_damaged_bags_are_read_or_refused(tmp_path, count):
     messages = sensor_messages()
     originals = {kind: bags.write_kind(kind, tmp_path, messages) for kind in bags.KINDS}
     contents = {

@@ -219,7 +219,9 @@ SPAN = 0.024 * 479 / 480
         ('last', 'up', SPAN, 0.0),
     ],
 )
-def test_row_times(reference, direction, first, last):
+def test_row_times_count_from_the_reference_row_in_the_readout_direction(
+    reference, direction, first, last
+):
     camera = make_camera(reference_row=reference, readout_direction=direction)
     np.testing.assert_allclose(camera.row_times([0.0, 479.0]), [first, last], atol=1e-15)
     np.testing.assert_allclose(camera.row_time_span, sorted((first, last)), atol=1e-15)

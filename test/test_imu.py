@@ -153,7 +153,7 @@ def test_coverage_and_values_of_a_series_in_any_order(stamps, asked, pruned):
         np.testing.assert_allclose(found[1][:, 0], np.interp(at, known, np.square(known)))
 
 
-def test_coverage():
+def test_the_buffer_knows_which_times_it_covers():
     buffer = ImuBuffer(ImuConfig(max_imu_gap=0.02))
     end = START + 9 * PERIOD
     assert buffer.gyro.coverage(START, START + 1) is Coverage.NOT_YET
@@ -912,7 +912,7 @@ def test_covariance_holds_for_drawn_errors(walk):
     assert np.mean(nees) == pytest.approx(6.0, abs=0.6)
 
 
-def test_shifted_rows(walk):
+def test_a_motion_shifted_to_later_rows_is_the_integrated_one(walk):
     """Between rows 12 ms later: as integrated there."""
     begin = 0.7
     duration = 0.2

@@ -346,7 +346,7 @@ def test_region_and_binning_shift_rows(types, change, size, corners):
         ('equidistant', 4),
     ],
 )
-def test_known_distortion(types, model, count):
+def test_distortions_of_known_models_are_taken_as_they_are(types, model, count):
     coefficients = tuple(0.001 * (i + 1) for i in range(count))
     calibration = intrinsics_from_info(build.camera_info(types, model=model, d=coefficients))
     assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
@@ -922,7 +922,7 @@ def values_of(messages: dict[str, Any]) -> dict[str, str]:
 
 
 @build.both_types
-def test_pair_messages(types):
+def test_messages_of_a_pair_have_the_frames_and_conventions_of_ros(types):
     """Frames and conventions of ROS; `test_published_pair` reads all values back."""
     result = pair()
     messages = build.pair_messages(result, types)

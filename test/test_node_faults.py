@@ -354,7 +354,7 @@ def test_diagnostics_count_what_happened(session):
     )
 
 
-def test_memory_stays(session):
+def test_the_memory_of_a_node_with_faulty_inputs_stays(session):
     assert session.memory_growth < 60.0
 
 

@@ -443,7 +443,7 @@ def test_every_field_is_documented(statistics):
     assert {reason.value for reason in Refusal} <= documented
 
 
-def test_level_and_text(statistics):
+def test_the_report_has_the_level_and_text_of_its_problem(statistics):
     found = statistics.report(Counter(), None, problem='why', missing=('a', 'b'))
     assert (found.level, found.text) == (ERROR, 'why')
     fields = dict(found.values)

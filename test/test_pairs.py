@@ -335,7 +335,7 @@ def test_other_intrinsics_and_a_frame_outside_of_the_buffer(library):
         view_frame(replace(frame2, stamp_ns=frame2.stamp_ns + 10**10), imu, parameters)
 
 
-def test_example(bundled_bag, bundled):
+def test_the_example_of_the_documentation_gives_the_pose_of_the_command(bundled_bag, bundled):
     """The script of the documentation gives the pose of the command line."""
     _, rows, _, _ = bundled
     row = rows[3]

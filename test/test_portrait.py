@@ -73,7 +73,7 @@ def test_times_and_rays_of_a_turned_pixel_stay(turns, read, reference_row):
     )
 
 
-def test_directions(direction, turns):
+def test_a_turned_camera_reads_to_the_right_or_left(direction, turns):
     turned = turned_camera(CAMERA, turns)
     assert turned.readout_direction == direction
     assert turned.reads_forward is (direction == 'right')

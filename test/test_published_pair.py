@@ -319,7 +319,7 @@ def test_nothing_is_left_of_an_unusable_pair(pairs):
         (lambda: PoseChain(min_shared_tracks=0), '^min_shared_tracks must be .*, got 0'),
     ],
 )
-def test_usage_is_checked(call, expected):
+def test_wrong_arguments_and_topics_are_named(call, expected):
     with pytest.raises(InputError, match=expected):
         call()
 

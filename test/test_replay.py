@@ -330,7 +330,7 @@ def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path,
 
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', ['realsense_rgb_rs', 'xiaomi_cc9_rs'])
-def test_recordings(converted, tmp_path, name):
+def test_replays_of_recordings_without_the_gyro_between_frames(converted, tmp_path, name):
     """With the gyro for the rows only, the rotation between the frames comes from the images.
 
     Without that of the gyro directions are less certain: 4 of 28 by more than 10 deg. Without the
@@ -528,7 +528,9 @@ def good_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ('', [*SENSOR, '--stamps', 'nowhere.txt'], 'nowhere.txt'),
     ],
 )
-def test_bad_use(tmp_path, refused, good_bag, monkeypatch, path, options, words):
+def test_bad_use_is_refused_before_anything_is_written(
+    tmp_path, refused, good_bag, monkeypatch, path, options, words
+):
     monkeypatch.chdir(tmp_path)
     refused(words, 'replay', path or good_bag, *options)
     assert not list(tmp_path.glob('*_relpose')), 'nothing is written before the input is known'
@@ -543,7 +545,7 @@ def test_bad_use(tmp_path, refused, good_bag, monkeypatch, path, options, words)
         (HEADER, 'line 1'),
     ],
 )
-def test_bad_stamps(tmp_path, refused, good_bag, text, words):
+def test_a_file_without_stamps_is_refused_with_its_line(tmp_path, refused, good_bag, text, words):
     file = tmp_path / 'stamps.txt'
     file.write_text(text)
     refused(

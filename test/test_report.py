@@ -216,7 +216,9 @@ def test_a_bag_without_anything_that_can_be_read(content, tmp_path):
         ([str(BAG), '--out', '.'], 'is a directory'),
     ],
 )
-def test_bad_input(words, problem, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_named_in_one_line_and_nothing_is_written(
+    words, problem, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert command_line.main(['report', *words]) == command_line.BAD_INPUT
     error = capsys.readouterr().err

@@ -248,7 +248,7 @@ def test_a_file_of_something_else_is_refused(content, tmp_path):
         ),
     ],
 )
-def test_bad_queries(rows, call, message):
+def test_queries_of_unknown_frames_or_times_are_refused(rows, call, message):
     with pytest.raises(InputError, match=message):
         call(rows)
 

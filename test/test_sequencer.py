@@ -279,7 +279,9 @@ def imu(first_ms, last_ms, step_ms=5):
         ),
     ],
 )
-def test_gaps_and_jumps(live, events, released, restarted, alone, refused, gaps, jumps):
+def test_frames_are_released_restarted_or_refused_at_gaps_and_jumps(
+    live, events, released, restarted, alone, refused, gaps, jumps
+):
     items = []
     for event in events:
         if isinstance(event, int):

@@ -213,7 +213,7 @@ def track_sequence(images, **settings):
     ],
     ids=['warp', 'frozen image', 'exposure', 'turned windows', 'jerk'],
 )
-def test_matches_of_warps(scene, views, noise, least, median, most):
+def test_matches_of_warped_images_are_accurate(scene, views, noise, least, median, most):
     H = [scene.similarity(*view[:3]) for view in views]
     images = [
         scene.view(noise=noise),
@@ -508,7 +508,7 @@ def test_illegal_settings_are_refused(values):
 
 
 @pytest.mark.parametrize('detector, exact', [('sift', 0.5), ('orb', 1.5)])
-def test_wide_baseline(scene, detector, exact):
+def test_descriptors_match_over_a_wide_baseline(scene, detector, exact):
     """Which corners cannot be followed over."""
     H2 = scene.similarity(40.0, 1.3, (70.0, -30.0))
     images = scene.view(noise=2.0), scene.view(H2, noise=2.0, gain=0.8, offset=10.0)
