@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
 from rs_relpose_ros.errors import library, MissingInputError, RsRelposeError
+from rs_relpose_ros.garbage import collect_seldom
 
 # Name of the command line. [derived: console script of setup.py]
 PROGRAM = 'rs_relpose'
@@ -172,6 +173,8 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line, by default the one of the process, and return its exit code."""
     use_one_blas_thread()
+    if argv is None:  # else the process is that of the caller
+        collect_seldom()
     try:
         code = _run(sys.argv[1:] if argv is None else list(argv))
         # If the pipe is closed, this raises here and not while the interpreter shuts down.

@@ -255,7 +255,7 @@ class SampleTimes:
         self._stamps.append(sample.stamp_ns)
         every = _EVERY if self._passed else _EVERY_AT_START
         if self._count % every == 0:
-            self.bursts = find_bursts(np.array(self._stamps))
+            self.bursts = find_bursts(np.fromiter(self._stamps, np.int64))
         if self.bursts is not None:
             self.corrects = self._passed
             waiting = [*self._waiting, sample]

@@ -19,6 +19,7 @@ import numpy as np
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.so3 import Vector
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.burst_times import SampleTimes
@@ -275,7 +276,7 @@ class StuckGyro:
 
     def __init__(self, longest: float) -> None:
         self._longest_ns = to_nanoseconds(longest)
-        self._values = [math.nan] * 3
+        self._values: Vector = (math.nan, math.nan, math.nan)
         self._largest = [0.0] * 3
         self._since_ns = [0] * 3
         self._counts = [0] * 3
@@ -286,9 +287,18 @@ class StuckGyro:
         if rate is None or self._longest_ns == 0:
             return False
         for axis, value in enumerate(rate):
-            self._add(axis, value, sample.stamp_ns)
-        if max(self._counts) == 1:
-            return False  # no axis repeats its value
+            size = abs(value)
+            if size > self._largest[axis]:
+                self._largest[axis] = size
+        before = self._values
+        self._values = rate
+        if rate[0] != before[0] and rate[1] != before[1] and rate[2] != before[2]:
+            # The usual sample, for which nothing is to be counted.
+            self._since_ns = [sample.stamp_ns] * 3
+            self._counts = [1, 1, 1]
+            return False
+        for axis in range(3):
+            self._count(axis, rate[axis] == before[axis], sample.stamp_ns)
         count = min(self._counts)
         since_ns = max(self._since_ns)
         clipped = self._clipped_axis(rate) if count == 1 else None
@@ -299,16 +309,13 @@ class StuckGyro:
             raise InputError(_fault(clipped, rate))
         return count > 1
 
-    def _add(self, axis: int, value: float, stamp_ns: int) -> None:
+    def _count(self, axis: int, is_same: bool, stamp_ns: int) -> None:
+        """Count how often an axis has had its value, `is_same` as that of the last sample."""
         # After the clock was set back the time of repetition counts from here.
-        if value != self._values[axis] or stamp_ns < self._since_ns[axis]:
-            self._values[axis] = value
+        if not is_same or stamp_ns < self._since_ns[axis]:
             self._since_ns[axis] = stamp_ns
             self._counts[axis] = 0
         self._counts[axis] += 1
-        size = abs(value)
-        if size > self._largest[axis]:
-            self._largest[axis] = size
 
     def _clipped_axis(self, rate: tuple[float, float, float]) -> int | None:
         """The first axis that repeats a value at which a driver or a filter may clip."""

@@ -16,6 +16,7 @@ knows the last ones (`Stream`). Both use the same rules:
 from collections import deque
 from collections.abc import Callable, Mapping
 from enum import Enum
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,7 +245,7 @@ class SensorRate:
         self._count += 1
         if self._count % _EVERY:
             return False
-        values = np.array(self._rates)
+        values = np.fromiter(chain.from_iterable(self._rates), np.float64).reshape(-1, 3)
         found, _ = find_multiplied(values)
         factor = round(found)
         changed = factor != self.factor

@@ -51,6 +51,15 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     'smoothed': {'color': '#0072B2', 'lw': 1.2},
 }
 
+# Place of the two plots in the picture, and the space between them, as shares of its width and
+# height: labels of the axes fit into the margins. [chosen: by a look at the picture]
+_MARGINS: Mapping[str, float] = {
+    'left': 0.07,
+    'right': 0.99,
+    'bottom': 0.1,
+    'top': 0.94,
+    'wspace': 0.16,
+}
 # Path as it was published live. [derived: interface, as the files below]
 LIVE_FILE = 'trajectory.tum'
 # Path estimated from all data.
@@ -555,8 +564,9 @@ def _relative_errors(
 
 def draw_paths(drawn: Mapping[str, ComparedPath], path: Path) -> Figure:
     """Paths by name, from above and their heights, with the ground truth if known."""
-    picture = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
-    above, height = picture.subplots(1, 2)
+    # A layout that Matplotlib computes would draw everything twice.
+    picture = Figure(figsize=(11.0, 5.5), dpi=110)
+    above, height = picture.subplots(1, 2, gridspec_kw=dict(_MARGINS))
     # Live paths begin later: the ground truth of the longest path is drawn.
     compared = [line for line in drawn.values() if line.truth is not None]
     longest = max(compared, key=lambda line: len(line.imu_ns), default=None)
