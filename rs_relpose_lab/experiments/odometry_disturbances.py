@@ -271,12 +271,13 @@ def errors_squared(states: Sequence[Odometry], first: Odometry, truth: TrueState
 def _interpolated(truth: TrueStates, at_ns: int) -> tuple[Array, Array]:
     """Position and rotation at a time between two samples."""
     k = int(np.searchsorted(truth.stamps_ns, at_ns))
-    part = (at_ns - truth.stamps_ns[k - 1]) / (truth.stamps_ns[k] - truth.stamps_ns[k - 1])
-    step = Rotation.from_matrix(truth.R[k - 1].T @ truth.R[k]).as_rotvec()
-    return (
-        truth.position[k - 1] + part * (truth.position[k] - truth.position[k - 1]),
-        truth.R[k - 1] @ Rotation.from_rotvec(part * step).as_matrix(),
-    )
+    begin_ns, end_ns = truth.stamps_ns[k - 1 : k + 1]
+    part = (at_ns - begin_ns) / (end_ns - begin_ns)
+    begin, end = truth.position[k - 1 : k + 1]
+    R_begin, R_end = truth.R[k - 1 : k + 1]
+    turn = Rotation.from_matrix(R_begin.T @ R_end).as_rotvec()
+    turned = Rotation.from_rotvec(part * turn).as_matrix()
+    return begin + part * (end - begin), R_begin @ turned
 
 
 # -- results ----------------------------------------------------------------------------------

@@ -158,7 +158,8 @@ class FinePath:
 
         def to_camera(points: Array, times: Array) -> Array:
             at = (reference + times - self.begin) / self.step
-            k = np.clip(at.astype(int), 0, len(self.steps) - 1)
+            last = len(self.steps) - 1
+            k = np.clip(at.astype(int), 0, last)
             share = (at - k)[:, None]
             step = self.positions[k + 1] - self.positions[k]
             position = self.positions[k] + share * step

@@ -157,15 +157,19 @@ class Groups(NamedTuple):
         """
         count = len(self.scores)
         middle = (count + 1) // 2
-        inverses, optima, variances = [], [], np.zeros(self.scores.shape[1])
-        for half, other in (
-            (slice(0, middle), slice(middle, count)),
-            (slice(middle, count), slice(0, middle)),
-        ):
+        first = slice(0, middle)
+        last = slice(middle, count)
+        inverses = []
+        optima = []
+        variances = np.zeros(self.scores.shape[1])
+        for half, other in ((first, last), (last, first)):
             own = inverse(self.hessian - self.curvatures[other].sum(axis=0))
-            of_model = own @ (variance * self.curvatures[half].sum(axis=0)) @ own
-            within = (self.scores[half] - self.scores[half].mean(axis=0)) @ own
-            scatter = (within**2).sum(axis=0) * len(within) / max(len(within) - 1, 1)
+            curvature = self.curvatures[half].sum(axis=0)
+            of_model = own @ (variance * curvature) @ own
+            scores = self.scores[half]
+            within = (scores - scores.mean(axis=0)) @ own
+            groups = len(within)
+            scatter = (within**2).sum(axis=0) * groups / max(groups - 1, 1)
             variances += np.maximum(np.diag(of_model), scatter)
             inverses.append(own)
             optima.append(own @ self.scores[other].sum(axis=0))
@@ -243,22 +247,32 @@ def weights_of_stretches(found: Fit) -> Array:
 
 def _misfit_of(found: Fit, part: NDArray[np.bool_]) -> float:
     """Chi-square over its degrees of freedom of some pairs, at the optimum of all others."""
-    at, curve = found.evaluation, bent(found.weights)
+    at = found.evaluation
+    curve = bent(found.weights)
     own = curve * at.reduced[part].sum(axis=0)
-    rest = curve * at.reduced.sum(axis=0) + found.problem.prior[found.block] - own
+    prior = found.problem.prior[found.block]
+    rest = curve * at.reduced.sum(axis=0) + prior - own
     # The score and its covariance at the optimum of the rest, which these pairs have moved.
     own_score = at.score[part].sum(axis=0)
     score = own_score + own @ np.linalg.solve(rest, own_score)
     covariance = own + own @ np.linalg.solve(rest, own)
-    # Scaled: the parameters have different units.
-    scale = 1.0 / np.sqrt(np.diag(rest + own))
+    weight = float(found.problem.weight[part].mean())
+    return _mean_square(score, covariance, np.diag(rest + own)) / weight
+
+
+def _mean_square(score: Array, covariance: Array, information: Array) -> float:
+    """Mean squared score (k,) in its sigmas, over the directions in which it says something.
+
+    The parameters have different units: they are scaled to the same `information` (k,).
+    """
+    scale = 1.0 / np.sqrt(information)
     scaled = covariance * np.outer(scale, scale)
-    variances, directions = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    symmetric = 0.5 * (scaled + scaled.T)
+    variances, directions = np.linalg.eigh(symmetric)
     along = directions.T @ (scale * score)
     says = variances > _SAYS_NOTHING * variances[-1]
     squares = along[says] ** 2 / variances[says]
-    weight = float(found.problem.weight[part].mean())
-    return float(squares.mean()) / weight
+    return float(squares.mean())
 
 
 def of_few_groups(count: int) -> float:

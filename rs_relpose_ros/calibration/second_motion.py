@@ -135,9 +135,8 @@ def second_share(data: PairData, inliers: Flags) -> float:
 
 def _tried(count: int) -> tuple[Numbers, Numbers]:
     """Pairs of numbers below `count`, from which motions are made."""
-    first, second = (
-        (np.arange(1, _TRIED + 1) * step % 1.0 * count).astype(np.int64) for step in _STEPS
-    )
+    steps = np.arange(1, _TRIED + 1)
+    first, second = ((steps * step % 1.0 * count).astype(np.int64) for step in _STEPS)
     return first, second
 
 
@@ -146,15 +145,20 @@ def _similar(points1: Array, points2: Array) -> Flags:
     if not len(points1):
         return np.zeros(0, dtype=bool)
     first, second = _tried(len(points1))
+    # As complex numbers: a similarity is ``after = turn before + shift``.
     before, after = (points[:, 0] + 1j * points[:, 1] for points in (points1, points2))
     apart = before[first] - before[second]
     usable = np.abs(apart) > _APART
     if not usable.any():
         return np.zeros(len(points1), dtype=bool)
-    turn = (after[first] - after[second])[usable] / apart[usable]
-    shift = after[first][usable] - turn * before[first][usable]
-    fit = np.abs(after - turn[:, None] * before - shift[:, None]) < _WITHIN
-    return np.asarray(fit[np.argmax(fit.sum(axis=1))])
+    first = first[usable]
+    second = second[usable]
+    turn = (after[first] - after[second]) / apart[usable]
+    shift = after[first] - turn * before[first]
+    errors = after - turn[:, None] * before - shift[:, None]
+    fit = np.abs(errors) < _WITHIN
+    best = np.argmax(fit.sum(axis=1))
+    return np.asarray(fit[best])
 
 
 def _in_planes(rays1: Array, rays2: Array, within: float) -> Flags:
@@ -166,14 +170,20 @@ def _in_planes(rays1: Array, rays2: Array, within: float) -> Flags:
         return np.zeros(0, dtype=bool)
     first, second = _tried(len(rays1))
     normals = np.cross(rays1, rays2)
+    squares1 = (rays1**2).sum(axis=1)
+    squares2 = (rays2**2).sum(axis=1)
     axes = np.cross(normals[first], normals[second])
     for _ in range(_ROUNDS):
-        axes /= np.maximum(np.linalg.norm(axes, axis=1), np.finfo(float).tiny)[:, None]
+        lengths = np.linalg.norm(axes, axis=1)
+        axes /= np.maximum(lengths, np.finfo(float).tiny)[:, None]
         # Of each ray, the part across an axis: how far a normal moves with a change of the ray.
-        across1 = (rays1**2).sum(axis=1) - (axes @ rays1.T) ** 2
-        across2 = (rays2**2).sum(axis=1) - (axes @ rays2.T) ** 2
-        fit = np.abs(axes @ normals.T) < within * np.sqrt(across1 + across2)
+        across1 = squares1 - (axes @ rays1.T) ** 2
+        across2 = squares2 - (axes @ rays2.T) ** 2
+        largest = within * np.sqrt(across1 + across2)
+        fit = np.abs(axes @ normals.T) < largest
         best = np.argsort(-fit.sum(axis=1))[:_REFINED]
-        moments = np.einsum('an,ni,nj->aij', fit[best].astype(float), normals, normals)
-        axes = np.linalg.eigh(moments)[1][:, :, 0]
+        weights = fit[best].astype(float)
+        moments = np.einsum('an,ni,nj->aij', weights, normals, normals)
+        _, directions = np.linalg.eigh(moments)
+        axes = directions[:, :, 0]
     return np.asarray(fit[best[0]])
