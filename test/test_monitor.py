@@ -628,6 +628,28 @@ def test_rotated_axes_and_another_unit_are_found(rotvec, scale, size):
     assert not compared.is_left_handed
 
 
+@pytest.mark.parametrize(('along', 'across', 'named'), [(2.0, 2.1, True), (1.0, 2.0, False)])
+def test_a_factor_of_all_axes_is_that_of_the_gyro(along, across, named):
+    """A focal length of twice the value changes the rotations across the optical axis alone."""
+    faults = faults_of(rotations(np.diag([across, across, along])))
+    assert [fault.code for fault in faults] == (['gyro_unit'] if named else [])
+    for fault in faults:
+        assert fault.estimate == pytest.approx(2.07, abs=0.05)
+        assert 'multiplied by about 2.1' in text_of(fault).fix
+
+
+def test_the_angle_of_the_gyro_is_in_proportion_to_its_unit():
+    """A rotation of more than half a turn does not show it."""
+    stamps_ns = 5 * MS * np.arange(21)
+    rates = np.outer(np.linspace(0.5, 1.5, 21), [0.3, -1.0, 0.6])
+    right, degrees = (
+        integration.ImuSlice(stamps_ns, factor * rates, np.zeros(3), 0.0, GYRO_NOISE)
+        for factor in (1.0, math.degrees(1.0))
+    )
+    np.testing.assert_allclose(degrees.angle, math.degrees(1.0) * right.angle)
+    np.testing.assert_allclose(right.angle, 0.1 * np.array([0.3, -1.0, 0.6]))
+
+
 @pytest.mark.parametrize('rotating', [True, False])
 def test_a_gyro_with_little_more_than_its_bias(rotating):
     """Rates 57 times too small are found beneath a bias; a camera on a rail rotates as little."""
@@ -955,6 +977,22 @@ def test_squeezed_images_are_named_by_pairs(squeeze):
         np.testing.assert_allclose(fault.estimated, right, atol=3.0 * fault.sigma)
 
 
+def test_another_lens_that_is_not_centred_is_named_with_its_coefficients():
+    """And not the principal point nor the axes, which nearly do the same."""
+    c = deviation(tangential=(0.006, -0.004))
+    sums = Posterior()
+    for k, pair in enumerate(flight(c, 14, start=0.1)):
+        assert sums.add(400 * MS * k, pair, NONE, NONE) is not None
+    for k in range(14):  # about the solution: pairs are not linear in it
+        sums.add(400 * MS * (14 + k), flight(c, 14, start=0.1)[k], NONE, sums.solved().c)
+    (fault,) = assessed(sums.solved(), EACH).faults
+    assert fault.code == 'tangential' and not fault.candidates
+    np.testing.assert_allclose(fault.estimated, (0.006, -0.004), atol=3.0 * fault.sigma)
+    set_to = fault.settings['distortion_coefficients']
+    np.testing.assert_allclose(set_to[2:4], fault.estimated, atol=1e-5)
+    assert set_to[:2] == pytest.approx(CAMERA.distortion[:2])
+
+
 def test_configured_sigma_of_the_lens_is_that_of_what_it_does_to_the_image():
     """All three coefficients are uncertain, by the displacement of the stated sigma of k1."""
     sigmas = assessment.configured_sigmas(
@@ -1154,6 +1192,17 @@ def test_what_few_pairs_showed_and_more_do_not_was_a_trace():
         worst_of(wrong, Assessment((hidden, by(90, 'gyro_scale', SUSPECT)))).faults[0].state
         is WRONG
     )
+
+
+def test_a_candidate_is_ruled_out_once_another_one_is_named_alone():
+    both = 'principal_point', 'tangential'
+    early = Assessment(tuple(replace(finding(c, WRONG), candidates=both) for c in both))
+    hidden = replace(finding('principal_point', UNKNOWN), why=Why.OTHER_INCONSISTENT)
+    named = finding('tangential', WRONG)
+    for candidates, left in (((), ['tangential']), (both, list(both))):
+        late = Assessment((hidden, replace(named, candidates=candidates)))
+        found = worst_of(early, late).faults
+        assert sorted(one.code.value for one in found) == sorted(left)
 
 
 # -- tracked parameters --------------------------------------------------------------------------

@@ -277,6 +277,13 @@ CASES: tuple[Case, ...] = (
         ('gyro_unit', 'gyro_scale'),
     ),
     Case(
+        'I3-half',
+        'gyro of half the rate: another full-scale range than its driver assumes',
+        partial(_D.gyro_factor, factor=0.5),
+        r'unit|full-scale|factor',
+        ('gyro_unit', 'gyro_scale'),
+    ),
+    Case(
         'I3-g',
         'accelerometer in g',
         partial(_D.accel_factor, factor=1.0 / 9.80665),
@@ -440,6 +447,13 @@ CASES: tuple[Case, ...] = (
     ),
     Case('G13', 'exposure as long as the frame interval', lambda one: one, r'', base='blurred'),
     Case('G14', 'a wide lens near its fold', lambda one: one, r'', base='fisheye', solvable=True),
+    Case(
+        'G15',
+        'p1 and p2 of another lens of the same model',
+        partial(_D.decentred, p1=0.004, p2=-0.003),
+        r'tangential',
+        ('tangential', 'principal_point'),
+    ),
     Case(
         'O1',
         'time_offset off by its own stated sigma of 5 ms',

@@ -333,6 +333,14 @@ def focal_scaled(recording: FieldRecording, factor: float) -> FieldRecording:
     return replace(recording, camera=off)
 
 
+def decentred(recording: FieldRecording, p1: float, p2: float) -> FieldRecording:
+    """The CameraInfo has other tangential coefficients, those of a lens of the same model."""
+    camera = recording.camera
+    k1, k2, *_ = camera.distortion
+    k3 = camera.distortion[4:5]
+    return replace(recording, camera=replace(camera, distortion=(k1, k2, p1, p2, *k3)))
+
+
 def squeezed(recording: FieldRecording, factor: float) -> FieldRecording:
     """Columns are resized by `factor`; the CameraInfo keeps equal focal lengths."""
     camera = recording.camera

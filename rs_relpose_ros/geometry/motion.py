@@ -25,6 +25,9 @@ _LARGEST = 1e4
 _LARGEST_LEVER_ARM = 5.0
 # Row times may lie outside of the gyro samples by this [s]. [derived: rounding of nanoseconds]
 _TOLERANCE = 1e-6
+# Time about the reference [s] for which a constant rate is a path: that of a global shutter, whose
+# rows have one time. [chosen: beyond any readout; 0.1 to 10 s would do]
+_AROUND = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,6 +140,19 @@ class FrameMotion:
         """Rays (N, 3) of row times (N,) [s], rotated into the frame of the reference row."""
         rays = np.asarray(rays, dtype=np.float64)
         return np.einsum('nij,nj->ni', self.rotations(row_times), rays)
+
+    def turned(self, turn: Array) -> FrameMotion:
+        """The same motion of rows whose axes are rotated by `turn` (3,) [rad] at the reference.
+
+        It is the rotation of what the rows show against the camera at the time of the reference.
+        """
+        if not turn.any():
+            return self
+        path = self.path
+        if path is None:
+            path = GyroPath.constant(self.angular_velocity, -_AROUND, _AROUND)
+        rotations = np.ascontiguousarray(exp_so3(turn) @ path.rotations)
+        return validate.replaced(self, path=path._replace(rotations=rotations))
 
     def shifted(self, delay: float) -> FrameMotion:
         """The same motion with the reference row `delay` seconds later."""

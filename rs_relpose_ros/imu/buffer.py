@@ -453,6 +453,19 @@ class ImuBuffer(ImuSamples):
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
+    def turn_of_exposure(self, middle_ns: int, exposure: float) -> Array:
+        """Rotation vector (3,) [rad] of an image against the orientation at its middle, IMU axes.
+
+        An image shows the mean orientation over its exposure h. With an angular acceleration a, it
+        is ``a h^2 / 24`` ahead of the orientation at the middle.
+        """
+        half = to_nanoseconds(0.5 * exposure)
+        exposed = self.gyro.between(middle_ns - half, middle_ns + half) if half else None
+        if exposed is None:
+            return np.zeros(3)
+        rates = exposed[1]
+        return np.asarray(exposure / 24.0 * (rates[-1] - rates[0]))
+
     def covers(self, start_ns: int, end_ns: int, exposure: float) -> bool:
         """Whether the gyro covers the exposures [s] of all rows between two times."""
         half = to_nanoseconds(0.5 * exposure)
@@ -575,6 +588,7 @@ def frame_imu(
     if gravity is not None:
         back = motion.rotations([(span_ns[1] - reference_ns) * 1e-9])[0]
         motion = validate.replaced(motion, gravity=back @ (R_cam_imu @ gravity.direction))
+    motion = motion.turned(R_cam_imu @ buffer.turn_of_exposure(reference_ns, exposure))
     start_ns = reference_ns if previous_reference_ns is None else previous_reference_ns
     before = buffer.force.between(min(start_ns, reference_ns), reference_ns)
     readout = buffer.force.between(*span_ns)
@@ -583,7 +597,7 @@ def frame_imu(
         no_force = 'the accelerometer has a gap'
     since_previous = None
     if start_ns < reference_ns and buffer.covers(start_ns, reference_ns, exposure):
-        since_previous = _slice(buffer, (start_ns, reference_ns), R_cam_imu, exposure, no_force)
+        since_previous = _slice(buffer, (start_ns, reference_ns), R_cam_imu, no_force)
         if not no_force and before is not None:
             since_previous = replace(
                 since_previous, force_stamps_ns=before[0], forces=before[1] @ R_cam_imu.T
@@ -615,11 +629,10 @@ def _slice(
     buffer: ImuBuffer,
     between_ns: tuple[int, int],
     R_cam_imu: Array,
-    exposure: float,
     no_force: str,
 ) -> ImuSlice:
-    """The gyro between two stamped rows."""
-    stamps_ns, rates = buffer.angular_velocity(*between_ns, exposure)
+    """The gyro between the middles of the exposures of two stamped rows."""
+    stamps_ns, rates = buffer.angular_velocity(*between_ns)
     bias = buffer.bias(between_ns[1])
     return ImuSlice(
         stamps_ns,
