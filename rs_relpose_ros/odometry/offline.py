@@ -444,7 +444,7 @@ def consistency(
     if not covered or not truth.covers(origin.imu_ns):
         return {'nees': None, 'beyond': None}
     turn = exp_so3(heading(origin.R @ truth.rotation(origin.imu_ns).T))
-    squares = np.array([_squared_errors(state, origin, turn, truth) for state in covered])
+    squares = _squared_errors(covered, origin, turn, truth)
     names = ('position', 'rotation', 'velocity')
     beyond = (squares > chi_squared_bound(3, _WITHIN)).mean(axis=0)
     return {
@@ -454,26 +454,38 @@ def consistency(
 
 
 def _squared_errors(
-    state: Odometry,
+    states: Sequence[Odometry],
     origin: Odometry,
     turn: Array,
     truth: TrueTrajectory,
-) -> tuple[float, float, float]:
-    """Chi squared of position, rotation and velocity; `turn`: from the truth's world to ours."""
-    R = turn @ truth.rotation(state.imu_ns)
-    way = truth.position(state.imu_ns) - truth.position(origin.imu_ns)
-    velocity = R.T @ turn @ truth.velocity(state.imu_ns)
-    pose, twist = state.pose_covariance, state.velocity_covariance
-    position_error = state.position - origin.position - turn @ way
-    return (
-        _chi_squared(position_error, pose[:3, :3]),
-        _chi_squared(log_so3(state.R @ R.T), pose[3:, 3:]),
-        _chi_squared(state.velocity - velocity, twist[:3, :3]),
-    )
+) -> Array:
+    """Chi squared (N, 3) of position, rotation and velocity.
+
+    `turn` (3, 3): from the truth's world to ours.
+    """
+    at_ns = [state.imu_ns for state in states]
+    rotations = turn @ truth.rotations(at_ns)
+    ways = truth.positions(at_ns) - truth.position(origin.imu_ns)
+    velocities = truth.velocities(at_ns) @ turn.T
+    places = np.array([state.position for state in states]) - origin.position
+    turns = [log_so3(state.R @ R.T) for state, R in zip(states, rotations, strict=True)]
+    moving = np.array([state.velocity for state in states])
+    # In the axes of the camera, as the velocities of states.
+    true_moving = np.einsum('nji,nj->ni', rotations, velocities)
+    of_poses = np.array([state.pose_covariance for state in states])
+    of_twists = np.array([state.velocity_covariance for state in states])
+    squares = [
+        _chi_squared(places - ways @ turn.T, of_poses[:, :3, :3]),
+        _chi_squared(np.array(turns), of_poses[:, 3:, 3:]),
+        _chi_squared(moving - true_moving, of_twists[:, :3, :3]),
+    ]
+    return np.stack(squares, axis=1)
 
 
-def _chi_squared(error: Array, covariance: Array) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
+def _chi_squared(errors: Array, covariances: Array) -> Array:
+    """Squares (N,) of errors (N, 3) by their covariances (N, 3, 3)."""
+    whitened = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    return np.asarray((errors * whitened).sum(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -526,7 +538,7 @@ def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> Com
         return ComparedPath(all_ns, positions.reshape(-1, 3))
     covered_ns = [pose.imu_ns for pose in covered]
     positions = np.array([pose.position for pose in covered])
-    true = np.array([truth.position(imu_ns) for imu_ns in covered_ns])
+    true = truth.positions(covered_ns)
     R, t, scale = aligned(positions, true)
     moved = positions @ R.T + t
     squares = ((moved - true) ** 2).sum(axis=1)

@@ -83,14 +83,26 @@ class TrueTrajectory:
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""
+        return self.positions([at_ns])[0]
+
+    def positions(self, at_ns: Sequence[int]) -> Array:
+        """Positions (N, 3) [m] at times that the poses cover."""
         return np.asarray(self._position(self._seconds(at_ns)))
 
     def velocity(self, at_ns: int) -> Array:
         """Velocity (3,) [m/s] in the world at a time that the poses cover."""
+        return self.velocities([at_ns])[0]
+
+    def velocities(self, at_ns: Sequence[int]) -> Array:
+        """Velocities (N, 3) [m/s] in the world at times that the poses cover."""
         return np.asarray(self._position(self._seconds(at_ns), 1))
 
     def rotation(self, at_ns: int) -> Array:
         """R (3, 3) from the camera to the world at a time that the poses cover."""
+        return self.rotations([at_ns])[0]
+
+    def rotations(self, at_ns: Sequence[int]) -> Array:
+        """R (N, 3, 3) from the camera to the world at times that the poses cover."""
         return np.asarray(self._rotation(self._seconds(at_ns)).as_matrix())
 
     def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
