@@ -86,6 +86,8 @@ def outcomes(
         error = intake.receive(role, message.message)
         if error is not None:
             yield MessageRefused(role, message.topic, error)
+        if not loop.sequencer.has_next():
+            continue  # most messages are samples of the IMU, which complete no frame
         while (outcome := loop.step()) is not None:
             yield outcome
     intake.finish()

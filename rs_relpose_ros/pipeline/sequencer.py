@@ -296,6 +296,11 @@ class Sequencer:
         with self._changed:
             return bool(self._queue) and self._queue[-1].ready_ns is None
 
+    def has_next(self) -> bool:
+        """Whether `take` may return something, before the end of the input."""
+        with self._changed:
+            return bool(self._refusals or (self._queue and self._queue[0].ready_ns is not None))
+
     def reset(self, reason: str = 'a reset was requested') -> None:
         """Drop all frames and the IMU history; tracking restarts with the next frame."""
         with self._changed:
