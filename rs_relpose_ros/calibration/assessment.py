@@ -134,7 +134,8 @@ def configured_sigmas(
     `from_reference` [s]: interval between frames less that to which the time offset refers.
     `offset_sigma` [s]: of the stamps of the gyro, which adds to the sigma of the time offset.
     """
-    sensor, sigmas = parameters.sensor, np.zeros(LIVE.size)
+    sensor = parameters.sensor
+    sigmas = np.zeros(LIVE.size)
     configured = parameters.deviation_sigmas()
     for name, sigma in configured.items():
         if name in LIVE.parts:
@@ -212,7 +213,8 @@ def find_inconsistencies(
             alternative = _inconsistency(second, other, other.certainty(second.own), effects)
         found = [one for one in found if one[0].entry != quantity.beside]
         found.append((quantity, certainty))
-        selected, together = selected | _parts_of(quantity), solution
+        selected = selected | _parts_of(quantity)
+        together = solution
     inconsistent = [
         _inconsistency(quantity, together, certainty, effects) for quantity, certainty in found
     ]
@@ -297,9 +299,11 @@ def undetermined(
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
-    odds, known = 0.0, configured.sigmas > 0.0
+    odds = 0.0
+    known = configured.sigmas > 0.0
     known[LIVE.part('gyro_bias')] = False
-    together, alone = ~known, np.zeros((LIVE.size, LIVE.size))
+    together = ~known
+    alone = np.zeros((LIVE.size, LIVE.size))
     estimated = replace(estimated, shared=1.0)
     for quantity in findings.QUANTITIES:
         part = quantity.part
@@ -392,21 +396,24 @@ class Solution(NamedTuple):
 
     def certainty(self, part: slice) -> float:
         """Some deviations in sigmas, as the parts of the pairs scatter in their direction."""
-        along, gain = self._along(part), max(self.gain(part), 0.0)
+        along = self._along(part)
+        gain = max(self.gain(part), 0.0)
         scattered = float(((self.by_pair[:, part] @ along) ** 2).sum())
         return math.sqrt(gain * min(gain / max(scattered, 1e-12), 1.0))
 
 
 def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> Solution:
     """Deviations, those `free` (K,) within their wide prior, others within configured sigmas."""
-    sigmas, active = np.where(free, LIVE.sigmas, configured.sigmas), configured.active
+    sigmas = np.where(free, LIVE.sigmas, configured.sigmas)
+    active = configured.active
     if free.any():
         factors = estimated.if_free[:, free].max(axis=1)
         if (factors != 1.0).any():
             estimated = replace(
                 estimated, S=factors[:, None, None] * estimated.S, b=factors[:, None] * estimated.b
             )
-    S, misfit = estimated.S.sum(axis=0), estimated.scatter * estimated.shared
+    S = estimated.S.sum(axis=0)
+    misfit = estimated.scatter * estimated.shared
     # Scaled: the deviations have different units.
     scale = np.outer(sigmas, sigmas)
     covariance = inverse(scale * S / misfit + np.eye(len(sigmas))) * scale
@@ -569,8 +576,10 @@ def _tracking(quantity: Quantity, estimated: float, configured: Configured) -> d
 
 def _equivalent_row(one: Inconsistency, configured: Configured) -> dict[str, Any]:
     """Another stamped row that is equivalent to the deviation of the time offset."""
-    camera, offset_at = configured.camera, LIVE.index('time_offset')
-    deviation, sigma = one.deviation[offset_at], math.sqrt(one.covariance[offset_at, offset_at])
+    camera = configured.camera
+    offset_at = LIVE.index('time_offset')
+    deviation = one.deviation[offset_at]
+    sigma = math.sqrt(one.covariance[offset_at, offset_at])
     for row in REFERENCE_ROWS:
         index = replace(camera, reference_row=row).reference_row_index
         offset = camera.line_delay * (camera.reference_row_index - index)
@@ -589,7 +598,8 @@ def _values(
     """
     if quantity.shapes is not None:
         shapes = quantity.shapes(configured)
-        left, covariance = shapes @ left, shapes @ covariance @ shapes.T
+        left = shapes @ left
+        covariance = shapes @ covariance @ shapes.T
     sigmas = np.sqrt(np.diag(covariance))
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma = float(sigmas[worst])
@@ -711,7 +721,8 @@ def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterat
 
 def _how_images_are_turned(rotations: RotationComparison) -> list[Why]:
     """What turned images would explain a rotation of the axes; empty if none would."""
-    angle, Q = rotations.angle, rotations.rotation
+    angle = rotations.angle
+    Q = rotations.rotation
     found = []
     about_view = float(log_so3(Q)[2])
     if abs(abs(about_view) - 0.5 * math.pi) < _QUARTER_TURN > angle - abs(about_view):
@@ -746,7 +757,8 @@ _JITTER_SIGMA = 0.2
 
 def noise_of_gyro(pair: PairData, configured: Configured) -> Finding | None:
     """The finding on the noise that the samples of a pair show; None if it is as configured."""
-    segment, active = pair.segment, configured.gyro_noise_density
+    segment = pair.segment
+    active = configured.gyro_noise_density
     # Where frames begin, samples are interpolated between others.
     step = np.quantile(np.diff(segment.stamps_ns), 0.75) / NANOSECONDS
     if segment.noise_density < NOISY * active or step > _FAST:

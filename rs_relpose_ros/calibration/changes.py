@@ -153,7 +153,8 @@ def drift_doubts(
             continue
         drift = _drift(solution, stamps_ns, quantity.entry)
         k = LIVE.index(quantity.entry)
-        narrowed, gain = drift.sigma / _DRIFT_SIGMAS[quantity.entry], drift.certainty
+        narrowed = drift.sigma / _DRIFT_SIGMAS[quantity.entry]
+        gain = drift.certainty
         if not configured.sigmas[k]:
             narrowed *= math.sqrt(solution.covariance[k, k]) / LIVE.sigmas[k]
             gain += solution.certainty(quantity.part) ** 2
@@ -188,7 +189,8 @@ def _change(
     pairs: int,
 ) -> Change:
     k = LIVE.index(entry)
-    now, sigma = float(found.off[k]), math.sqrt(found.covariance[k, k])
+    now = float(found.off[k])
+    sigma = math.sqrt(found.covariance[k, k])
     if kind is Kind.STEP:
         now += found.value
     return Change(entry, kind, found.value, found.sigma, now, sigma, between_ns, 0.5 * lead, pairs)
@@ -201,7 +203,8 @@ def _best(solution: Solution, weights: Array, prior: float, entry: str) -> tuple
     """
     estimated = solution.estimated
     misfit = estimated.scatter * estimated.shared
-    S, b = estimated.S / misfit, estimated.b / misfit
+    S = estimated.S / misfit
+    b = estimated.b / misfit
     k = LIVE.index(entry)
     columns = S[:, :, k]
     scores = b - S @ (solution.active + solution.off)
@@ -214,7 +217,8 @@ def _best(solution: Solution, weights: Array, prior: float, entry: str) -> tuple
     best = int(np.argmax(gains))
     value = float(gradients[best] / information[best])
     # Parts of the pairs in what is left of the gradient, the other deviations eliminated.
-    weight, along = weights[best], moved[best]
+    weight = weights[best]
+    along = moved[best]
     explained = weight[:, None] * columns - S @ along
     left = scores - value * explained
     parts = value * (weight * left[:, k] - left @ along)

@@ -259,7 +259,8 @@ class ClockSteps:
         """The last step, if the pairs after it contradict the gyro as well: it was none."""
         if not (self.in_doubt and self.on_trial):
             return None
-        last, self._last = self._last, None
+        last = self._last
+        self._last = None
         return last
 
     def _fits(self, pairs: Sequence[DoubtfulPair], stream: _Stream, offset: float) -> bool:
@@ -284,7 +285,8 @@ class ClockSteps:
         """Note how well a consistent pair agrees with the gyro; `measure` follows."""
         if not math.isfinite(pose.diagnostics.gyro_square):
             return
-        self._unmeasured, self._latest = self._latest, data
+        self._unmeasured = self._latest
+        self._latest = data
         self._chi_squares.append(pose.diagnostics.gyro_square)
 
     def measure(self) -> None:
@@ -292,7 +294,8 @@ class ClockSteps:
 
         Its last rows need the gyro of the last pair. No pose depends on it before the next pair.
         """
-        before, self._unmeasured = self._unmeasured, None
+        before = self._unmeasured
+        self._unmeasured = None
         if before is None or len(self._gyro) < 2:
             return
         both = self._gyro[-2].joined(self._gyro[-1])
@@ -351,7 +354,8 @@ class _Rows(NamedTuple):
     def of(cls, data: PairData) -> _Rows:
         """The rows of at most `_MATCHES` matches."""
         step = math.ceil(len(data.points1) / _MATCHES) or 1
-        first, second = data.points1[::step], data.points2[::step]
+        first = data.points1[::step]
+        second = data.points2[::step]
         rays = data.camera.unproject(first), data.camera.unproject(second)
         usable = np.isfinite(rays[0] + rays[1]).all(axis=1)
         stamps_ns = data.segment.stamps_ns

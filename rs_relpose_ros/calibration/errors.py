@@ -110,7 +110,8 @@ class Groups(NamedTuple):
     @classmethod
     def of_time(cls, final: Fit) -> Self:
         """The blocks of time."""
-        at, block = final.evaluation, blocks_of_time(final.problem.middles)
+        at = final.evaluation
+        block = blocks_of_time(final.problem.middles)
         names = np.unique(block)
         scores = np.stack([at.score[block == name].sum(axis=0) for name in names])
         reduced = np.stack([at.reduced[block == name].sum(axis=0) for name in names])
@@ -119,11 +120,14 @@ class Groups(NamedTuple):
     @classmethod
     def of_image(cls, final: Fit) -> Self:
         """The regions of the image: what the sums of the pairs lack without the matches there."""
-        problem, unknowns, free = final.problem, final.unknowns, final.free
+        problem = final.problem
+        unknowns = final.unknowns
+        free = final.free
         region = _regions(problem.points[0])
         sums = sums_of(problem, unknowns, free)
         whole = evaluation(problem, unknowns, sums)
-        scores, curvatures = [], []
+        scores = []
+        curvatures = []
         for name in np.unique(region):
             of_region = sums_of(problem.matches(region == name), unknowns, free)
             others = sums._replace(
@@ -187,7 +191,8 @@ def blocks_of_time(times: Array) -> NDArray[np.int64]:
 
 def _parts(times: Array, count: int) -> NDArray[np.int64]:
     """Which of equally long parts of the recording each time (P,) [s] belongs to."""
-    begin, duration = times.min(), max(float(np.ptp(times)), _LEAST_DURATION)
+    begin = times.min()
+    duration = max(float(np.ptp(times)), _LEAST_DURATION)
     numbers = ((times - begin) / duration * count).astype(np.int64)
     return np.minimum(numbers, count - 1)
 
@@ -317,7 +322,8 @@ def widened(final: Fit, *, in_images: bool = False) -> Fit:
     The errors of the priors, which recordings of one camera share, are no scatter.
     `in_images` is whether a tracker followed the points: its own errors are added.
     """
-    free, block = final.free, final.block
+    free = final.free
+    block = final.block
     by_prior = _by_prior(final)
     covariance = final.covariance - by_prior @ by_prior.T
     of_image = Groups.of_image(final).jackknife()

@@ -195,7 +195,8 @@ _READ = {
 
 
 def _by_columns(finding: Finding) -> Text:
-    direction, row = finding.settings['readout_direction'], finding.settings['stamp_row']
+    direction = finding.settings['readout_direction']
+    row = finding.settings['stamp_row']
     return Text(
         'the images are turned by 90 deg: rows of the sensor are read ' + _READ[direction],
         f'set readout_direction: {direction} and stamp_row: {row}',
@@ -380,7 +381,8 @@ def _offset_step(finding: Finding) -> Text:
 
 def _offset_drift(finding: Finding) -> Text:
     assert finding.estimate is not None and finding.sigma is not None
-    rate, sigma = 1e6 * finding.estimate, 1e6 * finding.sigma
+    rate = 1e6 * finding.estimate
+    sigma = 1e6 * finding.sigma
     return Text(
         f'the time offset between camera and IMU drifts by {rate:.0f} +- {sigma:.0f} ppm: it is '
         'followed from now on',
@@ -390,7 +392,8 @@ def _offset_drift(finding: Finding) -> Text:
 
 def _focal_drift(finding: Finding) -> Text:
     assert finding.estimate is not None and finding.sigma is not None
-    rate, sigma = 100.0 * finding.estimate, 100.0 * finding.sigma
+    rate = 100.0 * finding.estimate
+    sigma = 100.0 * finding.sigma
     return Text(
         f'the focal length changes by {rate:.3f} +- {sigma:.3f} % in a second: the lens zooms, or '
         'its focus follows the scene',

@@ -71,7 +71,8 @@ def initial(
     noise: float = _NOISE_AT_START,
 ) -> Unknowns:
     """A calibration with the assumed lens, and the most likely directions of the pairs."""
-    parameters, pairs = np.zeros(GLOBAL), problem.pairs
+    parameters = np.zeros(GLOBAL)
+    pairs = problem.pairs
     parameters[READOUT] = readout
     parameters[model.OFFSET] = offset
     parameters[model.BIAS] = bias
@@ -162,10 +163,12 @@ _LEAST_PARALLAX = 1e-6
 
 def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
     """Problem with priors of `bend` from the parallax per second of the matches."""
-    path, parameters = _path(problem, unknowns), unknowns.parameters
+    path = _path(problem, unknowns)
+    parameters = unknowns.parameters
     through = _through_lens(problem, unknowns)
     rays = []
-    offset, readout = parameters[model.OFFSET], parameters[READOUT]
+    offset = parameters[model.OFFSET]
+    readout = parameters[READOUT]
     for times, rows, points in zip(problem.times, problem.rows, through.points, strict=True):
         row_times = times[problem.pair] + offset + readout * rows
         directions = np.column_stack([points, np.ones(len(points))])
@@ -265,7 +268,8 @@ def evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evalua
     mixed = np.empty((k + 1, LOCAL, problem.pairs))
     mixed[:k] = hessian[:, k:, :k].transpose(2, 1, 0)
     mixed[k] = (sums.gradient[:, k:] + weights * own).T
-    factors, solved = np.zeros_like(damped), np.empty_like(mixed)
+    factors = np.zeros_like(damped)
+    solved = np.empty_like(mixed)
     factor_groups(damped, factors)
     for right, out in zip(mixed, solved, strict=True):
         solve_lower_groups(factors, right, out)
@@ -375,7 +379,8 @@ def _step(problem: Problem, at: _Iterate, free: Flags) -> _Iterate:
     cost = at.evaluation.cost + _prior_cost(problem, at.unknowns)
     H, gradient = normal_equations(problem, at.evaluation, at.unknowns, free)
     newton = -damped_step(H, gradient, _LEAST_OF_PARAMETERS)[0]
-    length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
+    length = math.sqrt(max(float(gradient @ newton), 0.0))
+    damping = at.damping
     # The weights of a robust loss make Gauss-Newton steps too short, by the share that the last
     # step left of itself: J. Barzilai, J. M. Borwein, Two-point step size gradient methods, 1988.
     square = max(float(at.newton @ H @ at.newton), _LEAST_SQUARE)
@@ -390,7 +395,8 @@ def _step(problem: Problem, at: _Iterate, free: Flags) -> _Iterate:
         if result.cost + _prior_cost(problem, tried) > cost:
             tried, tried_cost = _chosen(problem, tried, at.unknowns)
             if tried_cost + _prior_cost(problem, tried) > cost:
-                gain, damping = 1.0, max(_MORE_DAMPING * damping, _FIRST_DAMPING)
+                gain = 1.0
+                damping = max(_MORE_DAMPING * damping, _FIRST_DAMPING)
                 continue
             result = evaluate(problem, tried, free)
         damping = max(_LESS_DAMPING * damping, _LEAST_OF_PARAMETERS)
@@ -565,7 +571,8 @@ def cost_curve(
             parameters[READOUT] = values[k]
             moved = unknowns._replace(parameters=parameters)
             at = _descended(problem, moved, held, _STEPS_ALONG)
-            unknowns, costs[k] = at.unknowns, at.evaluation.cost
+            unknowns = at.unknowns
+            costs[k] = at.evaluation.cost
             progress(float(np.isfinite(costs).mean()))
     # A match of a frame is in many pairs: scaled to the curvature 1 / sigma^2 at the minimum.
     fewer = problem.begin[-1] / final.problem.begin[-1]

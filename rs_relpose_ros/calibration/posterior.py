@@ -170,7 +170,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
         linear.residuals - linear.by_state @ solved[:, -1],
         S,
     )
-    S, b = S / ratio, b / ratio
+    S = S / ratio
+    b = b / ratio
     by_deviation, whitened = _shifts(pair, problem, linear, normal)
     return PairInformation(
         S,
@@ -332,7 +333,8 @@ def residuals_by_deviation(state: TwoViewState, frames: list[FrameRows]) -> tupl
     total = np.zeros((len(baselines), N_DEVIATIONS))
     rates = ((-state.d1, state.dw1), (state.d2, state.dw2))
     for k, (velocity, rate) in enumerate(rates):
-        rows, to_first = frames[k], rotations[k]
+        rows = frames[k]
+        to_first = rotations[k]
         by_turn = by.by_rotation[:, k, None] @ to_first
         by_view = (by.by_rays[:, k] @ to_first).reshape(-1, 1, 9)
         by_time = by.by_baseline @ velocity + by.by_rotation[:, k] @ rate
@@ -350,7 +352,8 @@ def _gyro(pair: PairData) -> Array:
 
 def _normal_equations(linear: _Linearised, weights: Array, information: Array) -> _Normal:
     """Normal equations with the priors of the state, of which `information` (3, 3) is the gyro."""
-    H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    H = np.zeros((PARAMETERS, PARAMETERS))
+    gradient = np.zeros(PARAMETERS)
     priors.add_priors(linear.state, linear.prior, H, gradient)
     weighted = linear.by_state.T * weights
     mixed = weighted @ linear.by_deviation
@@ -369,7 +372,8 @@ def _normal_equations(linear: _Linearised, weights: Array, information: Array) -
 def _images_against_gyro(linear: _Linearised, normal: _Normal, information: Array) -> Array:
     """Log (3,) [rad] of the rotation by images alone and R_gyro^T: a step without that prior."""
     part = slice(THETA, THETA + 3)
-    H, gradient = normal.H.copy(), normal.gradient.copy()
+    H = normal.H.copy()
+    gradient = normal.gradient.copy()
     H[part, part] -= information
     gradient[part] -= information @ linear.theta
     return np.asarray(linear.theta - (inverse(H) @ gradient)[part])
@@ -384,7 +388,8 @@ def _images_by_deviation(
     a direction only the rotation changes.
     """
     of_theta = slice(THETA, THETA + 3)
-    of_priors, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    of_priors = np.zeros((PARAMETERS, PARAMETERS))
+    gradient = np.zeros(PARAMETERS)
     priors.add_priors(linear.state, linear.prior, of_priors, gradient)
     H = normal.H - of_priors
     H[POSE:, POSE:] += linear.prior.rate_weight * np.eye(PARAMETERS - POSE)
@@ -409,15 +414,19 @@ def _shifts(
     ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
     """
     assert problem.rotation_information is not None
-    part, direction = slice(THETA, THETA + 3), slice(TANGENT, TANGENT + 2)
+    part = slice(THETA, THETA + 3)
+    direction = slice(TANGENT, TANGENT + 2)
     more = np.linalg.inv(pair.segment.covariance) - problem.rotation_information
-    H, mixed = normal.H.copy(), normal.mixed.copy()
+    H = normal.H.copy()
+    mixed = normal.mixed.copy()
     H[part, part] += more
     mixed[part] -= more @ linear.gyro
-    covariance, tangent = inverse(H), so3.tangent_basis(linear.state.t)
+    covariance = inverse(H)
+    tangent = so3.tangent_basis(linear.state.t)
     moved = -covariance @ mixed
     to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
-    share, rates = middle_share(pair.camera), pair.segment.angular_velocities
+    share = middle_share(pair.camera)
+    rates = pair.segment.angular_velocities
     rate1 = to_middle @ rates[0]
     rate2 = to_middle @ (pair.segment.rotation @ rates[-1])
     moved[direction, _READOUT] += share * (tangent.T @ so3.skew(rate1) @ linear.state.t)
@@ -467,7 +476,8 @@ def _state(
     )
     t = pair.t
     if not np.isfinite(t).all():
-        t, fit = translation_direction(observations, R), True
+        t = translation_direction(observations, R)
+        fit = True
     velocity = t / pair.interval
     state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
     if not fit:
@@ -506,8 +516,10 @@ def at_other_times(pair: PairData, gyro: ImuSlice, deviations: Array) -> PairDat
     camera = pair.camera.with_signed_readout_time(
         pair.camera.signed_readout_time + float(deviations[_READOUT])
     )
-    known, (begin, end) = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9, camera.row_time_span
-    begin, end = begin - _LEAST_SPAN, end + _LEAST_SPAN
+    known = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9
+    begin, end = camera.row_time_span
+    begin = begin - _LEAST_SPAN
+    end = end + _LEAST_SPAN
     first, second = (
         seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k]) + float(deviations[_OFFSET])
         for k in (0, -1)
@@ -655,8 +667,10 @@ class Posterior:
             apart[-2] = math.inf  # now the gyro after it is known
         chosen = [k for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN] if apart[k] >= _NEAR]
         for k in chosen:
-            data, active = self._pairs[k].data, self._pairs[k].active
-            gyro, later = data.segment, last.about - active
+            data = self._pairs[k].data
+            active = self._pairs[k].active
+            gyro = data.segment
+            later = last.about - active
             if _far_in_time(later):  # by the gyro there
                 for n in (k - 1, k + 1):
                     other = self._pairs[n].data.segment if 0 <= n < len(self._pairs) else gyro
@@ -664,7 +678,8 @@ class Posterior:
                     if first.stamps_ns[-1] == second.stamps_ns[0]:
                         gyro = first.joined(second)
                 if (moved := at_other_times(data, gyro, later)) is not None:
-                    data, active = moved, active.copy()
+                    data = moved
+                    active = active.copy()
                     active[_TIMES] = last.about[_TIMES]
             if (information := pair_information(data, active, last.about)) is not None:
                 self._pairs[k] = self._pairs[k]._replace(about=last.about, information=information)
@@ -713,7 +728,8 @@ class Posterior:
         # Sandwich (White, Econometrica 1982), about the solution: scores about zero contain it.
         scores = b - S @ c
         sandwich = covariance @ (scores.T @ scores) @ covariance
-        widened, shared = ((n + _FEW_PAIRS) / n) ** 2, 1.0 + _SHARED**2 * n
+        widened = ((n + _FEW_PAIRS) / n) ** 2
+        shared = 1.0 + _SHARED**2 * n
         ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * widened
         weights = np.einsum('pii->pi', S)
         about = (weights * [pair.about for pair in self._pairs]).sum(axis=0) / np.maximum(

@@ -131,7 +131,8 @@ def signed_residuals(pose: RelativePose, matches: Matches) -> SignedResiduals:
     by_second = _crossed(first, baselines)
     radial = np.einsum('ij,ij->i', by_second, second)
     by_second = by_second - radial[:, None] * second
-    length_1, length_2 = _lengths(by_first), _lengths(by_second)
+    length_1 = _lengths(by_first)
+    length_2 = _lengths(by_second)
     length = np.maximum(np.hypot(length_1, length_2), _TINY)
     directions = by_second / np.maximum(length_2, _TINY)[:, None]
     return SignedResiduals(values / length, directions @ pose.R)
@@ -139,7 +140,8 @@ def signed_residuals(pose: RelativePose, matches: Matches) -> SignedResiduals:
 
 def _crossed(a: Array, b: Array) -> Array:
     """Cross products (N, 3) of vectors (N, 3), in a third of the time of `np.cross`."""
-    ahead, behind = [1, 2, 0], [2, 0, 1]
+    ahead = [1, 2, 0]
+    behind = [2, 0, 1]
     return np.asarray(a[:, ahead] * b[:, behind] - a[:, behind] * b[:, ahead])
 
 
@@ -182,7 +184,8 @@ class PairSums:
         share = points2 / (view.width, view.height)
         place = _parts(share, np.array([COLUMNS, ROWS]))
         band = _parts(share[:, view.readout_axis], np.array(_BANDS))
-        cell, size = place @ (1, COLUMNS), ROWS * COLUMNS
+        cell = place @ (1, COLUMNS)
+        size = ROWS * COLUMNS
         rate = float(np.linalg.norm(change))
         axis = pose.R @ change / max(rate, _TINY)
         return cls(
@@ -300,10 +303,12 @@ def map_by_groups(
     A group is one observation of a cell, and their scatter about its mean the variance, together
     with the bias of a tracker.
     """
-    total, number = sums.sum(axis=0), counts.sum(axis=0)
+    total = sums.sum(axis=0)
+    number = counts.sum(axis=0)
     left = sums - counts * (total / np.maximum(number, 1.0))
     shape = (int(groups.max(initial=-1)) + 1, len(labels))
-    by_group, present = np.zeros(shape), np.zeros(shape)
+    by_group = np.zeros(shape)
+    present = np.zeros(shape)
     np.add.at(by_group, groups, left)
     np.add.at(present, groups, counts)
     observed = (present > 0.0).sum(axis=0)
@@ -392,7 +397,8 @@ def _of_time(pairs: Sequence[PairSums], seconds: Array) -> ResidualMap:
     labels = tuple(f'{borders[k]:g} to {borders[k + 1]:g} s' for k in range(size))
     rotations = _weighted_rotations(pairs)
     known = np.isfinite(rotations)
-    blocks, values = all_blocks[known], rotations[known]
+    blocks = all_blocks[known]
+    values = rotations[known]
     total = _summed(blocks, values, size)
     number = _summed(blocks, None, size)
     means = total / np.maximum(number, 1.0)
@@ -419,7 +425,8 @@ def _of_halves(
     cells: Array, counts: Array, seconds: Array, groups: NDArray[np.int64]
 ) -> ResidualMap:
     """Halves of the image, of the pairs and of the time."""
-    column, row = np.arange(COLUMNS * ROWS) % COLUMNS, np.arange(COLUMNS * ROWS) // COLUMNS
+    column = np.arange(COLUMNS * ROWS) % COLUMNS
+    row = np.arange(COLUMNS * ROWS) // COLUMNS
     number = np.arange(len(cells))
     in_cells = np.ones(COLUMNS * ROWS, dtype=bool)
     in_pairs = np.ones(len(cells), dtype=bool)
@@ -465,7 +472,8 @@ class ResidualMaps:
     def clear(self) -> None:
         """Forget the pairs: those that come have another configuration."""
         self._pairs.clear()
-        self._tested_ns, self._maps = None, ()
+        self._tested_ns = None
+        self._maps = ()
 
     def maps(self) -> tuple[ResidualMap, ...]:
         """The maps of the pairs so far."""

@@ -209,7 +209,8 @@ class RotationSums(LastSeconds):
             return None
         left_of_all = _left(float((theta * phi).sum()), theta, phi)
         ends = (stamps_ns - stamps_ns[0]) / NANOSECONDS
-        offset, left_at_offset = None, math.inf
+        offset = None
+        left_at_offset = math.inf
         if left_of_all > _LEFT_AT_OFFSET:
             offset, left_at_offset = _offset_of(ends, intervals, theta, phi)
         if by_gyro < _ENOUGH_FOR_OFFSET:
@@ -345,7 +346,8 @@ class AccelerationSums(LastSeconds):
 
         `sigma`: of its difference from gravity, if scale and bias are as configured.
         """
-        self._length, self._length_sigma = length, sigma
+        self._length = length
+        self._length_sigma = sigma
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
         """Note the acceleration of a pair, or the reason why it has none."""

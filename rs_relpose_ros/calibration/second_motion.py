@@ -116,7 +116,8 @@ def second_share(data: PairData, inliers: Flags) -> float:
         return 0.0
     turned = rays[:, 9:12] @ problem.rotation.T
     within = _WITHIN / data.camera.fx
-    points1, points2 = data.points1[problem.valid], data.points2[problem.valid]
+    points1 = data.points1[problem.valid]
+    points2 = data.points2[problem.valid]
     # The larger of the two motions is found first.
     scene = _in_planes(rays[:, :3], turned, within)
     behind = np.zeros(len(rays), dtype=bool)
@@ -125,9 +126,11 @@ def second_share(data: PairData, inliers: Flags) -> float:
     rest = ~moved
     beside = np.count_nonzero(_in_planes(rays[rest, :3], turned[rest], within))
     if np.count_nonzero(scene | behind) >= np.count_nonzero(moved) + beside:
-        explained, of_object = np.count_nonzero(scene | behind), np.count_nonzero(behind)
+        explained = np.count_nonzero(scene | behind)
+        of_object = np.count_nonzero(behind)
     else:
-        explained, of_object = np.count_nonzero(moved) + beside, np.count_nonzero(moved)
+        explained = np.count_nonzero(moved) + beside
+        of_object = np.count_nonzero(moved)
     if of_object < least or explained < _EXPLAINED * len(inliers):
         return 0.0
     return of_object / len(inliers)
