@@ -206,16 +206,15 @@ def _cards(observation: Observation, write: Writer) -> str:
         usable = 'Not as it is' if poses else 'No: no pair has a pose'
     state = 'wrong' if is_unusable(observation) else 'suspect' if doubts else 'ok'
     first = (faults or doubts)[:1]
-    wrong = (
-        f'{len(faults)} failures, {len(doubts)} warnings' if first else 'No failure, no warning'
-    )
+    counts = (('failure', len(faults)), ('warning', len(doubts)))
+    wrong = ', '.join(f'{count} {name}{"s" * (count > 1)}' for name, count in counts if count)
     detail = ''.join(f'{one.code.value}: {one.message}. {one.fix}' for one in first)
     return (
         '<div class="cards">'
         f'<div class="{state}"><h2>Can I use this recording?</h2><p><strong>{usable}</strong></p>'
         f'<p>{_withheld(observation)}</p></div>'
         f'<div class="{"wrong" if faults else state}"><h2>What is wrong?</h2>'
-        f'<p><strong>{wrong}</strong></p><p>{write(detail)}</p></div>'
+        f'<p><strong>{wrong or "No failure, no warning"}</strong></p><p>{write(detail)}</p></div>'
         f'<div class="{state}"><h2>What do I get?</h2>{_gains(observation, write)}</div></div>'
     )
 
