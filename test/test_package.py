@@ -320,6 +320,19 @@ def test_gtsam_is_imported_where_odometry_runs_only():
     assert 'gtsam' not in loaded
 
 
+def test_all_tests_are_found_where_no_extra_is_installed():
+    """As on a ROS machine, where rosdep has installed what package.xml names."""
+    extras = ('av', 'dask', 'distributed', 'gtsam', 'ncore', 'playwright', 'telemetry_parser')
+    code = f"""
+import sys
+import pytest
+sys.modules.update(dict.fromkeys({extras}))
+sys.exit(pytest.main(['--collect-only', '-q', '-p', 'no:xdist', '-p', 'no:cacheprovider', 'test']))
+"""
+    ended = run(sys.executable, '-c', code, cwd=ROOT)
+    assert ended.returncode == 0, ended.stdout[-2000:]
+
+
 def test_modules_import_each_other_without_cycles():
     graph = {
         name: {module_behind(imported) for imported in imports(path)} - {name, ''}
