@@ -9,7 +9,7 @@ from scipy.stats import t as student_t
 from test_monitor import flight, NONE
 
 from rs_relpose_ros.calibration import assessment
-from rs_relpose_ros.calibration.findings import Code, FindingState
+from rs_relpose_ros.calibration.findings import Code, Finding, FindingState, Why
 from rs_relpose_ros.calibration.findings_text import line
 from rs_relpose_ros.calibration.second_motion import second_share, SecondMotions
 from rs_relpose_ros.estimator.result import Diagnostics, RelativePose, Status
@@ -97,6 +97,15 @@ def test_pairs_among_many_that_contradict_the_gyro_are_not_trusted(squares, with
     assert f'contradict each other in {differing} of the last {count} pairs' in text
     contradictions.clear()
     assert not contradictions.too_many
+
+
+def test_impossible_values_are_no_count_of_pairs():
+    """No pair need contradict the gyro where only values that no sensor has explain the pairs."""
+    fault = Finding(Code.GYRO_SCALE, FindingState.WRONG, Why.OFF)
+    finding = assessment.impossible([fault], 8)
+    text = line(finding)
+    assert text.startswith('unknown_cause is wrong: no value of gyro_scale that sensors have')
+    assert finding.candidates and 'of the last' not in text
 
 
 def test_pairs_between_many_that_contradict_the_gyro_are_not_trusted():

@@ -825,6 +825,18 @@ def contradicting(differing: int, pairs: int) -> Finding:
     )
 
 
+def impossible(faults: Sequence[Finding], pairs: int) -> Finding:
+    """The finding that only impossible values of parameters, `faults`, explain the last pairs."""
+    names = [fault.code.value for fault in faults]
+    return Finding(
+        Code.UNKNOWN_CAUSE,
+        FindingState.WRONG,
+        Why.IMPOSSIBLE,
+        evidence=Evidence(pairs=pairs, measured={'parameters': names}),
+        candidates=_CANDIDATES,
+    )
+
+
 def unexplained(estimated: Calibration, *, is_named: bool = False) -> Finding | None:
     """The finding that pairs contradict each other without a known cause; None if they agree.
 

@@ -135,6 +135,7 @@ class Why(str, Enum):
     DRIFTING = 'drifting'  # a clock runs at another rate, or a lens zooms or focuses
     UNEXPLAINED = 'unexplained'  # pairs contradict each other, whatever parameter is changed
     CONTRADICTING = 'contradicting'  # images the gyro, in most of the last pairs
+    IMPOSSIBLE = 'impossible'  # no possible value of a parameter makes them agree
     RESIDUALS = 'residuals'  # they have a pattern in a map
     # Gross errors: `is_gross`.
     GROSS = 'gross'

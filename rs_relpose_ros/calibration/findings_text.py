@@ -414,15 +414,32 @@ def _unknown_cause(finding: Finding) -> Text:
     )
 
 
+# What may be wrong where images and gyro do not agree, and what to do. [derived: text for people]
+_UNKNOWN_OF_BOTH = (
+    'and the cause is not known; candidates: the lens, stabilisation of lens or images, images '
+    'that were resized or squeezed without their CameraInfo, two views side by side in one image '
+    '(stereo), vibration, a moving object, clocks'
+)
+_COMPARE_BOTH = (
+    'compare size, lens and focal lengths of the CameraInfo with the images; switch stabilisation '
+    'off; run "rs_relpose calibrate"'
+)
+
+
 def _contradicting(finding: Finding) -> Text:
     evidence = finding.evidence
     return Text(
         f'images and gyro contradict each other in {evidence.measured["differing"]} of the last '
-        f'{evidence.pairs} pairs, and the cause is not known; candidates: stabilisation of lens '
-        'or images, images that were resized or squeezed without their CameraInfo, two views side '
-        'by side in one image (stereo), vibration, a moving object, clocks',
-        'compare size and focal lengths of the CameraInfo with the images; switch stabilisation '
-        'off; run "rs_relpose calibrate"',
+        f'{evidence.pairs} pairs, {_UNKNOWN_OF_BOTH}',
+        _COMPARE_BOTH,
+    )
+
+
+def _impossible(finding: Finding) -> Text:
+    names = ', '.join(finding.evidence.measured['parameters'])
+    return Text(
+        f'no value of {names} that sensors have makes images and gyro agree, {_UNKNOWN_OF_BOTH}',
+        _COMPARE_BOTH,
     )
 
 
@@ -486,6 +503,7 @@ _BY_CAUSE: dict[tuple[Code, Why], Callable[[Finding], Text]] = {
     (Code.FOCAL_DRIFT, Why.DRIFTING): _focal_drift,
     (Code.UNKNOWN_CAUSE, Why.UNEXPLAINED): _unknown_cause,
     (Code.UNKNOWN_CAUSE, Why.CONTRADICTING): _contradicting,
+    (Code.UNKNOWN_CAUSE, Why.IMPOSSIBLE): _impossible,
     (Code.UNKNOWN_CAUSE, Why.RESIDUALS): _pattern,
     (Code.GYRO_NOISE, Why.OFF): _noise_of_imu,
     (Code.ACCEL_NOISE, Why.OFF): _noise_of_imu,

@@ -317,12 +317,10 @@ class ConsistencyMonitor:
         self.health = assessment.assess(self.calibration, self._inconsistent, gross, configured)
         if not gross:
             self._test_without_cause()
-        # Rotations that have nothing in common are no small error of a parameter.
-        is_related = compared is None or not compared.is_unrelated
-        is_possible = bool(self.health.faults) and is_related and self._is_possible()
-        has_cause = bool(gross) or is_possible
-        if not has_cause and (self.contradictions.too_many or self.health.faults):
-            unknown = assessment.contradicting(*self.contradictions.counts)
+        contradicts = self.contradictions.counts[0] > _MOST_REJECTED
+        # Slow rotations look unrelated, too, by their noise, but then pairs agree with the gyro.
+        is_unrelated = contradicts and compared is not None and compared.is_unrelated
+        if not gross and (unknown := self._unknown_cause(is_unrelated)) is not None:
             others = assessment.not_evaluated(set(), unknown.code)
             self.health = Assessment((unknown, *others))
         if not gross and self._noise is not None and self._noise.state is FindingState.WRONG:
@@ -332,7 +330,6 @@ class ConsistencyMonitor:
         self._wrong_configuration = bool(self.health.faults)
         # Nor are velocities of rotations that contradict the gyro, or of frames with own errors.
         has_errors = bool(self.jitter) or self._noise is not None
-        contradicts = self.contradictions.counts[0] > _MOST_REJECTED
         if self._wrong_configuration or contradicts or has_errors:
             self.acceleration.clear()
         self._add_others(due.stamp_ns)
@@ -341,9 +338,21 @@ class ConsistencyMonitor:
         if not self.deviates_as_allowed(configured):
             self.health = self.residuals.added_to(self.health)
 
-    def _is_possible(self) -> bool:
-        """Whether a gyro can have the scale that is found."""
-        return bool(np.ptp(self._deviation()[LIVE.part('gyro_scale')]) <= _LARGEST_SPREAD)
+    def _unknown_cause(self, is_unrelated: bool) -> Finding | None:
+        """The finding that no cause is known; None if a parameter is one, or nothing is wrong.
+
+        `is_unrelated`: whether rotations of images and gyro have nothing in common, so that no
+        small error of a parameter is the cause.
+        """
+        differing, count = self.contradictions.counts
+        faults = self.health.faults
+        # The difference between the factors of a gyro's axes.
+        spread = np.ptp(self._deviation()[LIVE.part('gyro_scale')])
+        if faults and not is_unrelated and spread <= _LARGEST_SPREAD:
+            return None
+        if self.contradictions.too_many:
+            return assessment.contradicting(differing, count)
+        return assessment.impossible(faults, count) if faults else None
 
     def _add_others(self, stamp_ns: int) -> None:
         """Add the findings that do not depend on the parameters."""
