@@ -253,9 +253,10 @@ def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
 def test_derivatives_of_the_residuals_are_those_of_finite_differences(image):
     """By deviations that turn the views of an image or delay its rows, and by the lens."""
     pair = pair_data(0.4, 0.7, SMALL)
+    rng = np.random.default_rng(image)  # of its own: the same numbers whatever runs before it
     basis = np.eye(N_DEVIATIONS)
     state = TwoViewState(
-        pair.R, pair.t, *(pair.t / 0.3 + RNG.normal(size=(2, 3))), *RNG.normal(size=(2, 3)) / 50
+        pair.R, pair.t, *(pair.t / 0.3 + rng.normal(size=(2, 3))), *rng.normal(size=(2, 3)) / 50
     )
 
     def frames(camera=pair.camera, at=basis[0] * 0.0):
@@ -1530,10 +1531,12 @@ def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypa
     wider = wider[1] / wider[0]
     assert wider.min() >= 1.0
     assert wider[0].min() > 4.0
-    # The principal point, which nobody configured, has a doubt for one pair more than the others.
-    assert wider[11:, 0].max() < 1.2
+    # Nobody configured how well the principal point and p1, p2 are known, which nearly cancel each
+    # other: little motion leaves a doubt of them for longer than of others.
+    assert wider[12:, 0].max() < 1.4
+    assert np.median(wider[12:, 0]) < 1.1 and wider[23:, 0].max() < 1.05
     # The direction depends on many frames, and little on the configuration.
-    assert wider[10:, 1].max() < 1.1
+    assert wider[11:, 1].max() < 1.2 and np.median(wider[11:, 1]) < 1.1
 
 
 def estimated_pairs(c, count):
