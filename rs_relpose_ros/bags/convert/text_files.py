@@ -201,7 +201,8 @@ def optional_object(path: Path) -> Mapping[str, Any]:
 def check_file(path: Path, most_bytes: float = math.inf) -> Path:
     """Return the path of a file: MissingInputError without one, InputError if it is too large."""
     if not path.is_file():
-        raise MissingInputError(f'{path.name} is missing: there is no file {path}')
+        problem = 'is no regular file' if path.exists() else 'is missing'
+        raise MissingInputError(f'{path} {problem}')
     if path.stat().st_size > most_bytes:
         raise InputError(f'{path} has more than {most_bytes} bytes: it is another file')
     return path
