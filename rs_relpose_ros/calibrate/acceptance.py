@@ -23,6 +23,7 @@ from rs_relpose_ros.calibration.observations import (
     rates_at,
     Start,
 )
+from rs_relpose_ros.calibration.rotations import factor_of, is_other_factor
 from rs_relpose_ros.core.deviations import ENTRIES, OFFLINE
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
@@ -100,7 +101,11 @@ def refuse_other_motion(measured: MeasuredRates, start: Start, interval: float) 
         )
     alike = np.corrcoef(rates.images[known, :2].ravel(), rates.gyro[0][known, :2].ravel())[0, 1]
     factor = 1.0 / max(found.fast, 1e-3)
-    if alike > _SAME_ROTATION and not _OTHER_VIEW < found.fast < 1.0 / _OTHER_VIEW:
+    of_images, of_gyro = rates.images[known], rates.gyro[0][known]
+    along = factor_of(of_images[:, 2:], of_gyro[:, 2:])
+    is_factor = is_other_factor(along, factor_of(of_images[:, :2], of_gyro[:, :2]))
+    is_gross = not _OTHER_VIEW < found.fast < 1.0 / _OTHER_VIEW
+    if alike > _SAME_ROTATION and (is_gross or is_factor):
         in_degrees = abs(factor / math.degrees(1.0) - 1.0) < _SAME_UNIT
         unit = 'it is in deg/s' if in_degrees else f'it gives {factor:.2g} times the rotation'
         raise InputError(

@@ -131,12 +131,9 @@ class RotationComparison:
         """Whether all axes of the gyro have one factor that no calibration of a gyro has."""
         if self.count < _FEWEST_AT_OFFSET or self.by_gyro < _ENOUGH_TO_RELATE:
             return False
-        scales = np.array([self.scale_along, self.scale_across])
-        if self.left_as_configured > _LEFT_AT_OFFSET or (scales <= 0.0).any():
+        if self.left_as_configured > _LEFT_AT_OFFSET:
             return False
-        logarithms = np.log(scales)
-        is_alike = abs(logarithms[0] - logarithms[1]) < _ALIKE
-        return bool(is_alike and np.abs(logarithms).min() > _OTHER_FACTOR)
+        return is_other_factor(self.scale_along, self.scale_across)
 
     @property
     def is_at_another_time(self) -> bool:
@@ -232,8 +229,8 @@ class RotationSums(LastSeconds):
             np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt),
             np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
             trace / max(float((phi**2).sum()), _NO_ROTATION),
-            _factor(theta[:, 2:], phi[:, 2:]),
-            _factor(theta[:, :2], phi[:, :2]),
+            factor_of(theta[:, 2:], phi[:, 2:]),
+            factor_of(theta[:, :2], phi[:, :2]),
             by_gyro,
             len(self),
             left_at_offset,
@@ -241,7 +238,19 @@ class RotationSums(LastSeconds):
         )
 
 
-def _factor(theta: Array, phi: Array) -> float:
+def is_other_factor(along: float, across: float) -> bool:
+    """Whether images turn by one factor of the gyro that no calibration of a gyro has.
+
+    `along` and `across` are images over gyro about the optical axis and across it.
+    """
+    if min(along, across) <= 0.0:
+        return False
+    logarithms = np.log([along, across])
+    is_alike = abs(logarithms[0] - logarithms[1]) < _ALIKE
+    return bool(is_alike and np.abs(logarithms).min() > _OTHER_FACTOR)
+
+
+def factor_of(theta: Array, phi: Array) -> float:
     """Components (N, M) of the images' rotations over those of the gyro."""
     return float((theta * phi).sum()) / max(float((phi**2).sum()), _NO_ROTATION)
 
