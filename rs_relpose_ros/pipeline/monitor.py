@@ -348,7 +348,11 @@ class ConsistencyMonitor:
         faults = self.health.faults
         # The difference between the factors of a gyro's axes.
         spread = np.ptp(self._deviation()[LIVE.part('gyro_scale')])
-        if faults and not is_unrelated and spread <= _LARGEST_SPREAD:
+        # What is only suspect moves no rotation so far that most of the pairs contradict the gyro,
+        # but stamps that jitter do.
+        contradict = self.contradictions.too_many and not self.jitter
+        explains = self.health.state is FindingState.WRONG or not contradict
+        if faults and explains and not is_unrelated and spread <= _LARGEST_SPREAD:
             return None
         if self.contradictions.too_many:
             return assessment.contradicting(differing, count)
