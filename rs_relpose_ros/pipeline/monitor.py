@@ -45,6 +45,10 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 # Number of frames by whose arrival the clocks are compared. Fewer would take a burst of the
 # transport for another clock; more would notice it later. [chosen: under a second at 30 Hz]
 _ARRIVALS = 20
+# Sigmas of a suspect value beyond which it may be the cause of pairs that contradict the gyro.
+# Fewer would name what stabilised images make of the parameters, more would miss a bias that is
+# off. [measured: at most 4.4 with stabilised images; 5 to 8 would do]
+_SURE = 5.0
 # Number of the latest pairs on whose poses the shift by a deviation is evaluated. Fewer would
 # follow the motion of a moment; more would forget late what a quiet motion is.
 # [chosen: about 5 s of pairs]
@@ -348,10 +352,11 @@ class ConsistencyMonitor:
         faults = self.health.faults
         # The difference between the factors of a gyro's axes.
         spread = np.ptp(self._deviation()[LIVE.part('gyro_scale')])
-        # What is only suspect moves no rotation so far that most of the pairs contradict the gyro,
-        # but stamps that jitter do.
+        # What is hardly suspect moves no rotation so far that most of the pairs contradict the
+        # gyro, but stamps that jitter do.
         contradict = self.contradictions.too_many and not self.jitter
-        explains = self.health.state is FindingState.WRONG or not contradict
+        is_sure = any(one.state is FindingState.WRONG or _is_sure(one) for one in faults)
+        explains = is_sure or not contradict
         if faults and explains and not is_unrelated and spread <= _LARGEST_SPREAD:
             return None
         if self.contradictions.too_many:
@@ -493,6 +498,13 @@ class ConsistencyMonitor:
     def _deviation(self) -> Array:
         """(K,) from the active values, of all inconsistent quantities."""
         return sum((one.deviation for one in self._inconsistent), np.zeros(LIVE.size))
+
+
+def _is_sure(finding: Finding) -> bool:
+    """Whether a value is off by more than `_SURE` of its sigmas."""
+    if finding.estimate is None or finding.active is None or finding.sigma is None:
+        return False
+    return abs(finding.estimate - finding.active) > _SURE * finding.sigma
 
 
 def _finding_of_step(
