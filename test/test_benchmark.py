@@ -29,6 +29,7 @@ from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
 from rs_relpose_lab.experiments.trust_rows import PLACES, RIGHT, ROWS
 from rs_relpose_lab.experiments.trust_runs import TrackNoise
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibration.findings import Code
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -565,11 +566,11 @@ def test_command_distinguishes_wrong_from_right(tmp_path):
     [
         ('gyro-degrees', 1.0, {'gyro_unit'}),
         ('upside-down', 1.0, {'axes', 'image_geometry'}),
-        ('K-1.3', 2.0, {'distortion', 'focal_length', 'image_geometry'}),
+        ('K-1.3', 2.0, {'focal_length', 'unknown_cause'}),
     ],
 )
 def test_pairs_that_contradict_the_gyro_have_no_pose_but_reveal_the_reason(row, end, named):
-    """Of K-1.3 pairs alone reveal it, and none has a pose."""
+    """Of K-1.3 pairs alone reveal it, none has a pose, and a lens would fit them as well."""
     recording = trust.recording_of(trust.BagPlan(1, 64005, 3.0, 0.0186))
     pairs = [
         pair
@@ -579,4 +580,7 @@ def test_pairs_that_contradict_the_gyro_have_no_pose_but_reveal_the_reason(row, 
     ]
     assert sum('contradict' in pair.pose.reason for pair in pairs) >= 4
     assert not any(pair.pose or pair.pose.rotation_known for pair in pairs)
-    assert {fault.code for fault in pairs[-1].health.faults} & named
+    faults = {fault.code: fault for fault in pairs[-1].health.faults}
+    assert faults.keys() & named
+    if 'unknown_cause' in faults:
+        assert 'focal_length' in faults[Code.UNKNOWN_CAUSE].candidates

@@ -22,6 +22,7 @@ from rs_relpose_ros.calibration.observations import GyroSeries, TrackedPoints
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig
+from rs_relpose_ros.core.deviations import TANGENTIAL_SIGMA
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -136,7 +137,8 @@ def test_lens_whose_coefficients_cancel_is_found(tmp_path):
     assert abs(focal['value'] - SMALL.fx) < 3.0 * focal['sigma'] < 0.1 * SMALL.fx
     intrinsics = read_parameters(out / 'calibration.yaml').intrinsics.of_image(320, 240)
     assert intrinsics.distortion_model == 'plumb_bob'
-    assert len(intrinsics.distortion) == 5 and intrinsics.distortion[2:4] == (0.0, 0.0)
+    assert len(intrinsics.distortion) == 5
+    np.testing.assert_allclose(intrinsics.distortion[2:4], 0.0, atol=2.0 * TANGENTIAL_SIGMA)
     assert intrinsics.distortion[4] == pytest.approx(values['distortion'][2]['value'], abs=1e-5)
 
 
@@ -146,9 +148,10 @@ def test_lens_is_estimated_about_the_distortion_of_a_camera_info(bag, tmp_path):
     camera = SMALL.camera
     for found, expected in zip(values['distortion'], camera.radial_coefficients, strict=True):
         assert abs(found['value'] - expected) < 3.0 * found['sigma']
-    # Tangential coefficients stay those of the CameraInfo.
+    # The CameraInfo knows tangential coefficients better than most motions show them.
     written = read_parameters(tmp_path / 'out' / 'calibration.yaml').intrinsics
-    assert written.of_image(320, 240).distortion[2:4] == camera.distortion[2:4]
+    sideways = written.of_image(320, 240).distortion[2:4]
+    np.testing.assert_allclose(sideways, camera.distortion[2:4], atol=2.0 * TANGENTIAL_SIGMA)
 
 
 def test_lens_of_a_binned_image_is_not_estimated(bag, tmp_path, capsys):

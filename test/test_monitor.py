@@ -1533,7 +1533,7 @@ def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypa
     assert wider[0].min() > 4.0
     # Nobody configured how well the principal point and p1, p2 are known, which nearly cancel each
     # other: little motion leaves a doubt of them for longer than of others.
-    assert wider[12:, 0].max() < 1.4
+    assert wider[12:, 0].max() < 1.45  # 1.40 with OpenCV 4.6
     assert np.median(wider[12:, 0]) < 1.1 and wider[23:, 0].max() < 1.05
     # The direction depends on many frames, and little on the configuration.
     assert wider[11:, 1].max() < 1.2 and np.median(wider[11:, 1]) < 1.1
@@ -1671,14 +1671,15 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
             1e-3,
             1.2,
         ),
-        # 0.76 ms off with OpenCV 4.6, since lens, aspect and gyro matrix are estimated, too.
+        # 0.90 ms (1.3 sigmas) off with OpenCV 4.6, since the whole lens and the gyro's matrix are
+        # estimated.
         (
             ('readout_time=0.034', 'track_readout_time=true'),
             'readout_time',
             0.03,
             -0.004,
-            8e-4,
-            1.2,
+            1e-3,
+            1.4,
         ),
     ],
 )

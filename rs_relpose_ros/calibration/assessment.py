@@ -812,6 +812,8 @@ _FEWEST_IF_NAMED = 50
 # What changes images or gyro from pair to pair, other than any deviation of the configuration.
 # [derived: codes of the findings whose texts say what to do]
 _CANDIDATES = (Code.IMAGE_GEOMETRY, Code.GYRO_NOISE, Code.TIME_OFFSET)
+# The same, and what makes images and gyro contradict each other in every pair. [derived: as above]
+_CANDIDATES_OF_BOTH = (*_CANDIDATES, Code.FOCAL_LENGTH, Code.DISTORTION)
 
 
 def contradicting(differing: int, pairs: int) -> Finding:
@@ -821,7 +823,7 @@ def contradicting(differing: int, pairs: int) -> Finding:
         FindingState.WRONG,
         Why.CONTRADICTING,
         evidence=Evidence(pairs=pairs, measured={'differing': differing}),
-        candidates=_CANDIDATES,
+        candidates=_CANDIDATES_OF_BOTH,
     )
 
 
@@ -833,7 +835,7 @@ def impossible(faults: Sequence[Finding], pairs: int) -> Finding:
         FindingState.WRONG,
         Why.IMPOSSIBLE,
         evidence=Evidence(pairs=pairs, measured={'parameters': names}),
-        candidates=_CANDIDATES,
+        candidates=_CANDIDATES_OF_BOTH,
     )
 
 
