@@ -818,23 +818,24 @@ _CANDIDATES_OF_BOTH = (*_CANDIDATES, Code.FOCAL_LENGTH, Code.DISTORTION)
 
 def contradicting(differing: int, pairs: int) -> Finding:
     """The finding that images contradict the gyro in `differing` of the last pairs."""
-    return Finding(
-        Code.UNKNOWN_CAUSE,
-        FindingState.WRONG,
-        Why.CONTRADICTING,
-        evidence=Evidence(pairs=pairs, measured={'differing': differing}),
-        candidates=_CANDIDATES_OF_BOTH,
-    )
+    evidence = Evidence(pairs=pairs, measured={'differing': differing})
+    return _unknown_of_both(Why.CONTRADICTING, evidence)
 
 
 def impossible(faults: Sequence[Finding], pairs: int) -> Finding:
     """The finding that only impossible values of parameters, `faults`, explain the last pairs."""
     names = [fault.code.value for fault in faults]
+    evidence = Evidence(pairs=pairs, measured={'parameters': names})
+    return _unknown_of_both(Why.IMPOSSIBLE, evidence)
+
+
+def _unknown_of_both(why: Why, evidence: Evidence) -> Finding:
+    """The finding that images and gyro do not agree, for a cause that is not known."""
     return Finding(
         Code.UNKNOWN_CAUSE,
         FindingState.WRONG,
-        Why.IMPOSSIBLE,
-        evidence=Evidence(pairs=pairs, measured={'parameters': names}),
+        why,
+        evidence=evidence,
         candidates=_CANDIDATES_OF_BOTH,
     )
 

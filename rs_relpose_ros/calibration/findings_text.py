@@ -414,12 +414,13 @@ def _unknown_cause(finding: Finding) -> Text:
     )
 
 
-# What may be wrong where images and gyro do not agree, and what to do. [derived: text for people]
+# What may be wrong where images and gyro do not agree. [derived: text for people]
 _UNKNOWN_OF_BOTH = (
     'and the cause is not known; candidates: focal length or lens, stabilisation of lens or '
     'images, images that were resized or squeezed without their CameraInfo, two views side by '
     'side in one image (stereo), vibration, a moving object, clocks'
 )
+# What to do then. [derived: text for people]
 _COMPARE_BOTH = (
     'compare size, lens and focal lengths of the CameraInfo with the images; switch stabilisation '
     'off; run "rs_relpose calibrate"'
